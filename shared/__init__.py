@@ -1,0 +1,17 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What edge units and the master agree on. It imports neither of them.
+
+In the order of the flow:
+
+    errors      the one tree of errors that the project raises
+    clock       the only place that reads the time
+    transforms  rigid transforms `T_a_b` as (4, 4) matrices
+    camera      pinhole intrinsics of a depth camera
+    lattice     the voxel grid that the whole cell shares
+    meshes      triangle meshes and their files
+    kinematics  a robot's links at given joint positions (Algorithm 5)
+    cell        the watched workspace: box, CAD, known objects, robot, board
+    settings    what an operator may change while everything runs
+    messages    what units and master say to each other, as models
+    wire        those messages as bytes
+"""

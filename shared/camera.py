@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pinhole intrinsics of a depth camera."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from shared.errors import InputError
+
+MAX_SIDE_PX = 4096
+"""Wider than any depth camera that we know; keeps a pixel index well inside int32."""
+
+D435_BASELINE_M = 0.050
+"""Distance of the two infrared imagers of a RealSense D435/D435i (data sheet, 50 mm)."""
+
+
+class Intrinsics(BaseModel):
+    """A pinhole camera without distortion, pixel centres at integer coordinates.
+
+    `fx, fy, cx, cy` are in pixels; a raw depth of 1 is `depth_scale_m` metres. The stereo error
+    of a measured depth follows from the distance of the imagers and the focal length at which they
+    match, `fx_stereo`; it differs from `fx` when the depth image was aligned to another camera.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    width: int = Field(gt=0, le=MAX_SIDE_PX)
+    height: int = Field(gt=0, le=MAX_SIDE_PX)
+    fx: float = Field(gt=0.0, allow_inf_nan=False)
+    fy: float = Field(gt=0.0, allow_inf_nan=False)
+    cx: float = Field(allow_inf_nan=False)
+    cy: float = Field(allow_inf_nan=False)
+    depth_scale_m: float = Field(default=0.001, ge=1e-6, le=0.1)
+    stereo_baseline_m: float = Field(default=D435_BASELINE_M, ge=0.005, le=1.0)
+    fx_stereo: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        depth_scale_m: float = 0.001,
+        stereo_baseline_m: float = D435_BASELINE_M,
+        fx_stereo: float | None = None,
+        **unknown: object,
+    ) -> None:
+        super().__init__(
+            width=width,
+            height=height,
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
+            depth_scale_m=depth_scale_m,
+            stereo_baseline_m=stereo_baseline_m,
+            fx_stereo=fx_stereo,
+            **unknown,
+        )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width), the shape of an image."""
+        return self.height, self.width
+
+    @property
+    def stereo_focal_px(self) -> float:
+        """The focal length at which the imagers match."""
+        return self.fx if self.fx_stereo is None else self.fx_stereo
+
+    def disparity_noise_m(self, subpixel_px: float) -> float:
+        """The `c` of the stereo error `sigma(z) = c * z**2` when disparity is off by `subpixel_px`."""
+        return subpixel_px / (self.stereo_focal_px * self.stereo_baseline_m)
+
+    def deproject(self, depth: NDArray[np.uint16]) -> NDArray[np.float64]:
+        """Points (H, W, 3) in metres, camera frame, of a raw depth image (H, W); z is 0 where nothing was measured."""
+        z_m = depth.astype(np.float64) * self.depth_scale_m
+        v, u = np.mgrid[0 : self.height, 0 : self.width]
+        return np.stack(((u - self.cx) / self.fx * z_m, (v - self.cy) / self.fy * z_m, z_m), axis=-1)
+
+    def project(self, points_camera_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixel coordinates (..., 2) as (u, v) of points (..., 3) in front of the camera."""
+        x, y, z = np.moveaxis(points_camera_m, -1, 0)
+        return np.stack((x / z * self.fx + self.cx, y / z * self.fy + self.cy), axis=-1)
+
+    def check_depth(self, depth: object) -> NDArray[np.uint16]:
+        """Return `depth` if it is a (height, width) uint16 image in C order.
+
+        Raises:
+            InputError: it is not an array, or of another dtype or shape.
+        """
+        if not isinstance(depth, np.ndarray):
+            raise InputError(f"depth: expected a numpy array, got {type(depth).__name__}")
+        if depth.dtype != np.uint16:
+            raise InputError(f"depth: expected dtype uint16 (units of depth_scale_m), got {depth.dtype}")
+        if depth.shape != self.shape:
+            raise InputError(f"depth: expected shape {self.shape} (height, width), got {depth.shape}")
+        return np.ascontiguousarray(depth)

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an operator may change while everything runs; every field has a range and a default.
+
+One set of defaults serves every cell, camera and resolution; where a figure depends on the
+camera (noise, pixels) it is derived from the camera's own intrinsics.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+DensityModel = Literal["pinhole", "angular"]
+DensityRule = Literal["neighbourhood", "single"]
+
+
+class FilterSettings(BaseModel):
+    """How a unit decides what is an obstacle. Frozen; unknown names are rejected."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    voxel_size_m: float = Field(
+        default=0.05, ge=0.01, le=0.10, description="Edge of a voxel in metres."
+    )
+    occupancy_threshold: float = Field(
+        default=0.75,
+        ge=0.05,
+        le=2.0,
+        description="Share of the points that one full voxel would show at its distance; less is noise.",
+    )
+    density_model: DensityModel = Field(
+        default="pinhole", description="How the full count is reckoned: pinhole, or the paper's angular average."
+    )
+    density_rule: DensityRule = Field(
+        default="neighbourhood",
+        description="Whose points count: those of the 27 voxels around, or (the paper) of each voxel alone.",
+    )
+    own_share_min: float = Field(
+        default=0.05, ge=0.0, le=1.0, description="Share that a voxel must hold by itself under the neighbourhood rule."
+    )
+    support_area_max_m2: float = Field(
+        default=0.0025,
+        ge=1e-4,
+        le=0.01,
+        description="Never ask for more surface than this (m2), so that thin things survive large voxels.",
+    )
+    margin_base_m: float = Field(
+        default=0.04, ge=0.0, le=0.5, description="Constant part of the margin before CAD surfaces, in metres."
+    )
+    margin_noise_gain: float = Field(
+        default=3.0, ge=0.0, le=20.0, description="Standard deviations of stereo noise in the margin before CAD."
+    )
+    stereo_subpixel_px: float = Field(
+        default=0.12, ge=0.01, le=1.0, description="Standard deviation of the camera's disparity, in pixels."
+    )
+    reference_margin_base_m: float = Field(
+        default=0.04, ge=0.0, le=0.5, description="Constant part of the margin before learned surfaces, in metres."
+    )
+    reference_spread_gain: float = Field(
+        default=3.0, ge=0.0, le=20.0, description="Standard deviations of a learned pixel in its margin."
+    )
+    edge_radius_px: int = Field(
+        default=5,
+        ge=0,
+        le=15,
+        description="Static limits take the nearest over this radius (pixels at 1280 wide, scaled to the camera).",
+    )
+    robot_padding_m: float = Field(
+        default=0.03, ge=0.0, le=0.3, description="How far the robot's links are inflated, in metres."
+    )
+    robot_depth_m: float = Field(
+        default=0.15,
+        ge=0.0,
+        le=1.0,
+        description="What lies deeper than this behind the padded robot is no robot any more, in metres.",
+    )
+    range_min_m: float = Field(default=0.0, ge=0.0, le=5.0, description="Nearer measurements are ignored, in metres.")
+    range_max_m: float = Field(default=10.0, ge=0.5, le=60.0, description="Farther measurements are ignored, in metres.")
+    seen_block_size_m: float = Field(
+        default=0.10, ge=0.05, le=1.0, description="Edge of the blocks in which a unit reports what it sees through."
+    )
+    seen_share_min: float = Field(
+        default=0.9, ge=0.5, le=1.0, description="Share of a block's rays that must pass through it to call it seen."
+    )
+
+
+class Settings(FilterSettings):
+    """All that `PUT /settings` takes: the filter's fields, and when a view is too old to be trusted."""
+
+    stale_after_s: float = Field(
+        default=0.5, ge=0.05, le=60.0, description="A unit whose last view is older is stale, in seconds."
+    )
+    robot_stale_after_s: float = Field(
+        default=0.5, ge=0.02, le=60.0, description="Joint positions older than this are no basis for a filter, in seconds."
+    )

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+# Every target makes .venv by itself, from constraints.txt, when it is missing or older than its list of packages.
+
+SHELL := /bin/sh
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo real test lint clean libusb
+
+ARGS ?=
+EXTRAS := edge,master,realsense,sim,dev
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/ready
+BENCH_READY := $(VENV)/ready-bench
+TYPED := $(wildcard shared edge_unit master_server simulation benchmarks)
+
+# Recorded data, where it lies beside the checkout.
+ifneq ($(wildcard ../shared/data),)
+export CELLWATCH_DATA ?= $(abspath ../shared/data)
+endif
+
+help: ## this list
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1 \t\2/p' Makefile | expand -t 20
+	@echo 'Arguments go through ARGS: make demo ARGS="--seconds 20". Another Python: make PYTHON=python3.12 ...'
+
+demo: $(READY) ## a simulated cell with a moving robot, people and many cameras
+	@$(BIN)/python -m simulation.demo $(ARGS)
+
+real: $(READY) ## the filter on recorded frames of a real cell (CELLWATCH_DATA names where they lie)
+	@$(BIN)/python -m benchmarks.real $(ARGS)
+
+test: $(READY) libusb lint ## lint, then all tests but the slow ones; with SLOW=1 these too
+	@$(BIN)/python -m pytest -q $(if $(SLOW),,-m "not slow") $(ARGS)
+
+lint: $(READY) ## ruff and mypy
+	@$(BIN)/ruff check -q .
+	@$(if $(TYPED),$(BIN)/mypy --no-error-summary $(TYPED),)
+
+clean: ## takes out .venv and all caches
+	rm -rf $(VENV) build dist out .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(READY): pyproject.toml constraints.txt
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || { python=$$(scripts/find-python) && \
+	    echo "making $(VENV) with $$($$python --version) (some 1 GB, a minute or two)" && \
+	    $$python -m venv --clear $(VENV); }
+	@$(BIN)/python -m pip install -q -c constraints.txt pip
+	@$(BIN)/python -m pip install -q -c constraints.txt --build-constraint constraints.txt -e '.[$(EXTRAS)]'
+	@touch $@
+
+# Peers to measure against: large, so only the targets that need them ask for them.
+$(BENCH_READY): $(READY)
+	@echo "adding the peers of the benchmarks to $(VENV) (some 2 GB)"
+	@$(BIN)/python -m pip install -q -c constraints.txt --build-constraint constraints.txt -e '.[$(EXTRAS),bench]'
+	@touch $@
+
+libusb: $(READY)
+	@$(BIN)/python -c 'import ctypes; ctypes.CDLL("libusb-1.0.so.0")' 2>/dev/null || { \
+	    echo "Cellwatch: the RealSense library needs libusb-1.0; get it with: sudo apt-get install libusb-1.0-0" >&2; exit 1; }

@@ -20,9 +20,7 @@ class FilterSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    voxel_size_m: float = Field(
-        default=0.05, ge=0.01, le=0.10, description="Edge of a voxel in metres."
-    )
+    voxel_size_m: float = Field(default=0.05, ge=0.01, le=0.10, description="Edge of a voxel in metres.")
     occupancy_threshold: float = Field(
         default=0.75,
         ge=0.05,
@@ -76,7 +74,9 @@ class FilterSettings(BaseModel):
         description="What lies deeper than this behind the padded robot is no robot any more, in metres.",
     )
     range_min_m: float = Field(default=0.0, ge=0.0, le=5.0, description="Nearer measurements are ignored, in metres.")
-    range_max_m: float = Field(default=10.0, ge=0.5, le=60.0, description="Farther measurements are ignored, in metres.")
+    range_max_m: float = Field(
+        default=10.0, ge=0.5, le=60.0, description="Farther measurements are ignored, in metres."
+    )
     seen_block_size_m: float = Field(
         default=0.10, ge=0.05, le=1.0, description="Edge of the blocks in which a unit reports what it sees through."
     )
@@ -92,5 +92,8 @@ class Settings(FilterSettings):
         default=0.5, ge=0.05, le=60.0, description="A unit whose last view is older is stale, in seconds."
     )
     robot_stale_after_s: float = Field(
-        default=0.5, ge=0.02, le=60.0, description="Joint positions older than this are no basis for a filter, in seconds."
+        default=0.5,
+        ge=0.02,
+        le=60.0,
+        description="Joint positions older than this are no basis for a filter, in seconds.",
     )

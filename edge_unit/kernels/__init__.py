@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The arithmetic of a frame: pure functions on arrays, compiled by numba, all memory handed in.
+
+They import only numpy, numba, math and one another; each has a slow twin in plain numpy in the tests.
+In the order of the flow:
+
+    jit         how kernels are compiled
+    rasterize   meshes onto the screen: nearest and farthest inverse depth (Algorithms 2 to 4)
+    limits      expected depth less margins, as raw depth that a pixel is compared with
+    reference   surfaces that the empty cell shows, learned pixel by pixel
+    foreground  the pixels that nothing known explains
+    voxelize    foreground pixels counted on the lattice (Algorithm 1)
+    density     voxels with too few points are noise (Algorithms 6 and 7)
+    seen        which blocks of the cell a frame looks through
+    agreement   how well measured depth fits expected depth
+"""

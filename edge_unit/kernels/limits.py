@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Expected depth less margins, as raw depth that a measured pixel is compared with.
+
+Limits are uint16 in the camera's own units, so that the filter compares without converting.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_unit.kernels.jit import kernel
+
+RAW_MAX = 65535
+"""The largest raw depth."""
+
+
+@kernel
+def static_limit_raw(
+    cad_w: NDArray[np.float32],
+    reference_m: NDArray[np.float32],
+    spread_m: NDArray[np.float32],
+    cad_base_m: float,
+    cad_noise_per_m: float,
+    reference_base_m: float,
+    reference_gain: float,
+    range_max_m: float,
+    depth_scale_m: float,
+    limit_raw: NDArray[np.uint16],
+) -> None:
+    """Per pixel, the raw depth at which what is measured is no longer nearer than all that stands still.
+
+    The nearer of the CAD surface, `z - (base + noise * z**2)` with `cad_w` = 1/z (H, W), and the learned surface,
+    `z - (base + gain * spread)` with `reference_m`, `spread_m` (H, W), NaN where nothing was learned;
+    `range_max_m` where neither is known. Out: `limit_raw` (H, W), rounded down.
+    """
+    height, width = limit_raw.shape
+    for y in range(height):
+        for x in range(width):
+            limit_m = range_max_m
+            w = cad_w[y, x]
+            if w > 0.0:
+                z = 1.0 / w
+                limit_m = min(limit_m, z - (cad_base_m + cad_noise_per_m * z * z))
+            learned = reference_m[y, x]
+            if learned == learned:
+                limit_m = min(limit_m, learned - (reference_base_m + reference_gain * spread_m[y, x]))
+            limit_raw[y, x] = np.uint16(min(max(math.floor(limit_m / depth_scale_m), 0), RAW_MAX))
+
+
+@kernel
+def nearest_over(
+    image: NDArray[np.uint16], radius_px: int, scratch: NDArray[np.uint16], out: NDArray[np.uint16]
+) -> None:
+    """Minimum over the square of `radius_px` around each pixel, (H, W); `scratch` (H, W)."""
+    height, width = image.shape
+    for y in range(height):
+        for x in range(width):
+            nearest = image[y, x]
+            for k in range(max(x - radius_px, 0), min(x + radius_px, width - 1) + 1):
+                nearest = min(nearest, image[y, k])
+            scratch[y, x] = nearest
+    for y in range(height):
+        for x in range(width):
+            out[y, x] = scratch[y, x]
+        for k in range(max(y - radius_px, 0), min(y + radius_px, height - 1) + 1):
+            for x in range(width):
+                out[y, x] = min(out[y, x], scratch[k, x])
+
+
+@kernel
+def robot_band_raw(
+    nearest_w: NDArray[np.float32],
+    farthest_w: NDArray[np.float32],
+    first_row: int,
+    last_row: int,
+    first_column: int,
+    last_column: int,
+    noise_per_m: float,
+    depth_m: float,
+    depth_scale_m: float,
+    near_raw: NDArray[np.uint16],
+    span_raw: NDArray[np.uint16],
+) -> None:
+    """The band of raw depths in which a measurement belongs to the robot, inside a rectangle of the image.
+
+    From the nearest padded surface less its noise margin to the farthest padded surface plus its margin plus
+    `depth_m`: what stands behind the robot's silhouette is still seen. The band is stored as its lower end
+    and its length, so that the filter needs one unsigned compare; where there is no robot the band is empty
+    (lower end 65535). `nearest_w`, `farthest_w` (H, W) of 1/m; out (H, W).
+    """
+    units = np.float32(1.0 / depth_scale_m)
+    noise = np.float32(noise_per_m)
+    behind = np.float32(depth_m)
+    for y in range(first_row, last_row + 1):
+        for x in range(first_column, last_column + 1):
+            w_near = nearest_w[y, x]
+            z_near = np.float32(1.0) / w_near
+            z_far = np.float32(1.0) / farthest_w[y, x]
+            near = (z_near - noise * z_near * z_near) * units
+            far = (z_far + noise * z_far * z_far + behind) * units
+            near = min(max(near, np.float32(0.0)), np.float32(65535.0))
+            far = min(max(far, np.float32(0.0)), np.float32(65535.0))
+            low = np.int32(near) if w_near > 0.0 else np.int32(65535)
+            high = np.int32(far) if w_near > 0.0 else np.int32(65535)
+            near_raw[y, x] = np.uint16(low)
+            span_raw[y, x] = np.uint16(max(high - low, 0))

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every test stands on: recorded data, and guards that no test leaves anything running."""
+
+from __future__ import annotations
+
+import multiprocessing.resource_tracker as resource_tracker
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+from blockbuster import BlockBuster
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+SLOW_TIMEOUT_S = 600
+# What was told to stop may need a moment; what nobody told to stop outlives any moment.
+GRACE_S = 3.0
+# A blocking call stalls every other unit's updates, so async code of the daemons may make none.
+EVENT_LOOP_TESTS = tuple(CHECKOUT / "tests" / package for package in ("edge_unit", "master_server"))
+EVENT_LOOP_CODE = ("shared", "edge_unit", "master_server")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT_S))
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Iterator[Path]:
+    """Folder of the recorded data sets; `$CELLWATCH_DATA` names it while the session lasts.
+
+    Without the data a test is skipped, except where CI is set: there it fails.
+    """
+    folder = Path(os.environ.get("CELLWATCH_DATA") or CHECKOUT.parent / "shared" / "data").resolve()
+    if not folder.is_dir():
+        reason = f"no recorded data: {folder} is not a folder (CELLWATCH_DATA names another)"
+        if os.environ.get("CI"):
+            pytest.fail(reason, pytrace=False)
+        pytest.skip(reason)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CELLWATCH_DATA", str(folder))
+        yield folder
+
+
+def _threads() -> set[threading.Thread]:
+    return {thread for thread in threading.enumerate() if not thread.daemon}
+
+
+def _children() -> set[psutil.Process]:
+    """All processes below this one, but for the one that Python keeps for shared memory."""
+    tracker = getattr(resource_tracker._resource_tracker, "_pid", None)
+    return {child for child in psutil.Process().children(recursive=True) if child.pid != tracker}
+
+
+def _name(process: psutil.Process) -> str:
+    try:
+        return f"process {process.pid} ({' '.join(process.cmdline()) or process.name()})"
+    except psutil.Error:
+        return f"process {process.pid}"
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_running() -> Iterator[None]:
+    """Fail a test that leaves a non-daemon thread or a child process behind (and end the process)."""
+    threads, children = _threads(), _children()
+    yield
+    new_threads = _threads() - threads
+    for thread in new_threads:
+        thread.join(GRACE_S)
+    _, alive = psutil.wait_procs(_children() - children, timeout=GRACE_S)
+    left = [f"thread {thread.name}" for thread in new_threads if thread.is_alive()]
+    left += [_name(process) for process in alive]
+    for process in alive:
+        process.kill()
+    psutil.wait_procs(alive, timeout=GRACE_S)
+    if left:
+        pytest.fail(f"left running: {', '.join(left)}", pytrace=False)
+
+
+@pytest.fixture(autouse=True)
+def no_blocking_call(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fail an async test of a daemon when the daemon's code blocks its event loop."""
+    is_async = request.node.get_closest_marker("asyncio") is not None
+    if not (is_async and any(folder in request.path.parents for folder in EVENT_LOOP_TESTS)):
+        yield
+        return
+    guard = BlockBuster(scanned_modules=[name for name in EVENT_LOOP_CODE if (CHECKOUT / name).is_dir()])
+    guard.activate()
+    yield
+    guard.deactivate()

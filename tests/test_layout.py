@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The shape of the project: listings tell the flow, imports follow it, nothing names a machine."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+PACKAGES = ("shared", "edge_unit", "master_server", "simulation", "benchmarks")
+FORBIDDEN = {  # package: the packages that it never imports
+    "shared": {"edge_unit", "master_server", "simulation", "benchmarks", "tests"},
+    "edge_unit": {"master_server", "benchmarks", "tests"},
+    "master_server": {"edge_unit", "benchmarks", "tests"},
+    "simulation": {"benchmarks", "tests"},
+}
+KERNELS = ("edge_unit", "kernels")
+KERNEL_IMPORTS = {"__future__", "collections", "math", "numba", "numpy", "typing"}
+CLOCK = ("shared", "clock")
+WALL_CLOCK_CALLS = {"now", "utcnow", "today"}
+LISTED = re.compile(r"^ {4}(\w+/?) +\S", re.MULTILINE)
+# In brackets, so that this page does not find itself.
+MACHINE = re.compile(
+    r"(?<![\w.$}])/(?:[h]ome|[U]sers)/\w|(?<![\w.$}])/[r]oot/|[p]ypi\.org|python[h]osted|[n]pmjs\.(?:org|com)|deb\.[d]ebian\.org"
+)
+
+Module = tuple[str, ...]
+
+
+def listing(package: Path) -> list[str]:
+    """Names of a package's modules as its docstring lists them; sub-packages end in a slash."""
+    source = package / "__init__.py"
+    tree = ast.parse(source.read_text()) if source.is_file() else ast.Module([], [])
+    return LISTED.findall(ast.get_docstring(tree, clean=False) or "")
+
+
+def modules(root: Path) -> Iterator[tuple[Path, Module]]:
+    """Every Python file of the packages, with its dotted name as a tuple; a package's is that of its folder."""
+    for package in PACKAGES:
+        for file in sorted((root / package).rglob("*.py")):
+            parts = file.relative_to(root).with_suffix("").parts
+            yield file, parts[:-1] if parts[-1] == "__init__" else parts
+
+
+def imports(file: Path, module: Module) -> Iterator[tuple[int, Module]]:
+    """Line and dotted name of all that a file imports, at its top or inside a function."""
+    for node in ast.walk(ast.parse(file.read_text(), str(file))):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, tuple(alias.name.split("."))) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            folder = module if file.name == "__init__.py" else module[:-1]
+            base = folder[: len(folder) + 1 - node.level] if node.level else ()
+            base += tuple(node.module.split(".")) if node.module else ()
+            yield from ((node.lineno, (*base, alias.name)) for alias in node.names)
+
+
+def check_listings(root: Path) -> Iterator[str]:
+    """Each package's docstring lists exactly the modules that it has."""
+    folders = {folder for file, _ in modules(root) for folder in file.parents if folder.is_relative_to(root)}
+    for folder in sorted(folders - {root}):
+        listed = listing(folder)
+        present = {file.stem for file in folder.glob("*.py")} - {"__init__"}
+        present |= {f"{below.name}/" for below in folders if below.parent == folder}
+        where = f"{folder.relative_to(root)}/__init__.py:1"
+        yield from (f"{where}: does not list {name}" for name in sorted(present - set(listed)))
+        yield from (f"{where}: lists {name}, which is not there" for name in listed if name not in present)
+        yield from (f"{where}: lists {name} twice" for name in sorted(set(listed)) if listed.count(name) > 1)
+
+
+def check_order(root: Path) -> Iterator[str]:
+    """No module imports one that is listed below it."""
+    for file, module in modules(root):
+        for line, target in imports(file, module):
+            same = next((i for i, (a, b) in enumerate(zip(module, target, strict=False)) if a != b), 0)
+            if same == 0:
+                continue
+            order = [name.rstrip("/") for name in listing(root.joinpath(*module[:same]))]
+            if not {module[same], target[same]} <= set(order):
+                continue
+            if order.index(target[same]) > order.index(module[same]):
+                below = ".".join(target[: same + 1])
+                yield f"{file.relative_to(root)}:{line}: imports {below}, which is listed below {module[same]}"
+
+
+def check_packages(root: Path) -> Iterator[str]:
+    """Units and master never import each other; what both share imports neither."""
+    for file, module in modules(root):
+        for line, target in imports(file, module):
+            if target[0] in FORBIDDEN.get(module[0], ()):
+                yield f"{file.relative_to(root)}:{line}: {module[0]} imports {target[0]}"
+
+
+def check_kernels(root: Path) -> Iterator[str]:
+    """Kernels are pure functions on arrays: no I/O, no clock, no configuration."""
+    for file, module in modules(root):
+        for line, target in imports(file, module):
+            if module[:2] == KERNELS and target[:2] != KERNELS and target[0] not in KERNEL_IMPORTS:
+                yield f"{file.relative_to(root)}:{line}: a kernel imports {'.'.join(target)}"
+
+
+def check_clock(root: Path) -> Iterator[str]:
+    """The time is read in one module, so that all else can be tested without waiting."""
+    for file, module in modules(root):
+        if module == CLOCK:
+            continue
+        where = file.relative_to(root)
+        yield from (f"{where}:{n}: imports time" for n, target in imports(file, module) if target[0] == "time")
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+                owner = ast.unparse(node.func.value)
+                if node.func.attr in WALL_CLOCK_CALLS and owner.split(".")[-1] in {"datetime", "date"}:
+                    yield f"{where}:{node.lineno}: calls {owner}.{node.func.attr}"
+
+
+def check_machine(root: Path) -> Iterator[str]:
+    """No file names a home folder or the host of a package registry."""
+    git = ("git", "-C", str(root), "ls-files", "-z", "--cached", "--others", "--exclude-standard")
+    names = subprocess.run(git, capture_output=True, check=True, text=True).stdout.split("\0")
+    for file in (root / name for name in names if name):
+        try:
+            lines = file.read_text().splitlines()
+        except (UnicodeDecodeError, FileNotFoundError):  # a picture; a file taken out and not committed yet
+            continue
+        for number, text in enumerate(lines, 1):
+            if found := MACHINE.search(text):
+                yield f"{file.relative_to(root)}:{number}: names {found.group()}"
+
+
+CHECKS = (check_listings, check_order, check_packages, check_kernels, check_clock, check_machine)
+
+
+@pytest.mark.parametrize("check", CHECKS)
+def test_the_project_keeps(check: Callable[[Path], Iterator[str]]) -> None:
+    problems = list(check(CHECKOUT))
+    assert not problems, f"{check.__doc__}\n" + "\n".join(problems)
+
+
+def test_every_package_is_here() -> None:
+    assert [name for name in PACKAGES if not (CHECKOUT / name / "__init__.py").is_file()] == []
+
+
+BAD = {
+    "shared/__init__.py": '"""Shared.\n\n    clock  time\n    cell   box\n    ghost  gone\n    clock  again\n"""',
+    "shared/clock.py": "import time\nfrom . import cell",
+    "shared/cell.py": "import edge_unit.config\nfrom shared.clock import now\nfrom datetime import datetime as d",
+    "edge_unit/__init__.py": '"""Unit.\n\n    config    what\n    kernels/  how\n    pipeline  all\n"""',
+    "edge_unit/config.py": "def f():\n    from edge_unit.kernels import project\n    from time import sleep",
+    "edge_unit/kernels/__init__.py": '"""Kernels.\n\n    project  rays\n    density  sums\n"""',
+    "edge_unit/kernels/project.py": "import numpy as np, math\nfrom edge_unit.kernels import density\nimport os.path",
+    "edge_unit/kernels/density.py": "import numba\nfrom . import project\nfrom ..pipeline import run",
+    "edge_unit/pipeline.py": "import edge_unit.kernels.density\nimport master_server.app\nx = datetime.datetime.now()",
+    "edge_unit/loose/part.py": "",
+    "simulation/__init__.py": '"""Simulation."""',
+    "simulation/world.py": "import edge_unit.pipeline",
+    "notes.md": "fine: ~/x, $HOME/x, a/root/b\nlies in /" + "home/anna/x\nfrom py" + "pi.org",
+}
+EXPECTED = {
+    check_listings: [
+        "edge_unit/__init__.py:1: does not list loose/",
+        "edge_unit/loose/__init__.py:1: does not list part",
+        "shared/__init__.py:1: lists ghost, which is not there",
+        "shared/__init__.py:1: lists clock twice",
+        "simulation/__init__.py:1: does not list world",
+    ],
+    check_order: [
+        "shared/clock.py:2: imports shared.cell, which is listed below clock",
+        "edge_unit/config.py:2: imports edge_unit.kernels, which is listed below config",
+        "edge_unit/kernels/density.py:3: imports edge_unit.pipeline, which is listed below kernels",
+        "edge_unit/kernels/project.py:2: imports edge_unit.kernels.density, which is listed below project",
+    ],
+    check_packages: [
+        "shared/cell.py:1: shared imports edge_unit",
+        "edge_unit/pipeline.py:2: edge_unit imports master_server",
+    ],
+    check_kernels: [
+        "edge_unit/kernels/density.py:3: a kernel imports edge_unit.pipeline.run",
+        "edge_unit/kernels/project.py:3: a kernel imports os.path",
+    ],
+    check_clock: [
+        "edge_unit/config.py:3: imports time",
+        "edge_unit/pipeline.py:3: calls datetime.datetime.now",
+    ],
+    check_machine: ["notes.md:2: names /" + "home/a", "notes.md:3: names py" + "pi.org"],
+}
+
+
+@pytest.mark.parametrize("check", CHECKS)
+def test_the_check_finds_what_is_wrong(check: Callable[[Path], Iterator[str]], tmp_path: Path) -> None:
+    for name, text in BAD.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+    assert list(check(tmp_path)) == EXPECTED[check]

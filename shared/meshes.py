@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Triangle meshes: what CAD and robot links are rendered from.
+
+A mesh is *closed* when its surface bounds a volume and its triangles turn their front outwards
+(counter-clockwise seen from outside); only then may a renderer skip the triangles that it sees from
+behind. A mesh that is not closed is kept as it is and rendered from both sides.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from shared.errors import MeshError
+from shared.transforms import Transform
+
+MAX_TRIANGLES = 1_000_000
+"""18 MB of canonical bytes, and about a second to render on a unit; CAD exported finer than this is a mistake."""
+
+FILE_SUFFIXES = (".stl", ".obj", ".dae", ".ply")
+
+MERGE_DISTANCE_M = 1e-6
+"""Vertices on the same micrometre are one: STL repeats each vertex in every triangle that meets there."""
+
+MIN_TRIANGLE_AREA_M2 = 1e-12
+"""A square micrometre covers no pixel and has no usable normal."""
+
+MAX_COORDINATE_M = 1000.0
+"""No cell is a kilometre wide: coordinates beyond it are a file in millimetres without its `scale`."""
+
+CIRCLE_SEGMENTS = 48
+"""A cylinder of 0.1 m radius is then nowhere more than 0.2 mm inside the true one."""
+
+_HEADER = struct.Struct("<4sIII")
+_MAGIC = b"CWM1"
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """Triangles in metres. The arrays are read-only.
+
+    Attributes:
+        name: for messages; no part of the canonical bytes.
+        vertices: (V, 3) float32, metres, mesh frame.
+        faces: (F, 3) int32, indices into `vertices`.
+        closed: it bounds a volume and all its triangles face outwards.
+    """
+
+    name: str
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    closed: bool
+
+    def __post_init__(self) -> None:
+        with np.errstate(over="ignore"):
+            vertices = np.array(self.vertices, dtype=np.float32, order="C")
+        faces = np.array(self.faces, dtype=np.int32, order="C")
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+            raise MeshError(
+                f"mesh {self.name}: expected vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}"
+            )
+        if not len(faces):
+            raise MeshError(f"mesh {self.name}: expected at least one triangle, got none")
+        if len(faces) > MAX_TRIANGLES or len(vertices) > 3 * MAX_TRIANGLES:
+            raise MeshError(f"mesh {self.name}: expected at most {MAX_TRIANGLES} triangles, got {len(faces)}")
+        if not np.isfinite(vertices).all():
+            raise MeshError(f"mesh {self.name}: expected finite coordinates, got NaN or infinity")
+        if np.abs(vertices).max() > MAX_COORDINATE_M:
+            raise MeshError(
+                f"mesh {self.name}: expected coordinates within {MAX_COORDINATE_M:g} m, "
+                f"got {np.abs(vertices).max():.4g} m; for a file in millimetres set scale 0.001"
+            )
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise MeshError(
+                f"mesh {self.name}: expected face indices of 0 to {len(vertices) - 1}, "
+                f"got {faces.min()} to {faces.max()}"
+            )
+        vertices.flags.writeable = False
+        faces.flags.writeable = False
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+
+    @classmethod
+    def of_triangles(cls, name: str, vertices: NDArray[Any], faces: NDArray[Any]) -> TriangleMesh:
+        """A mesh of raw triangles: vertices merged, flat triangles dropped, `closed` found out.
+
+        Args:
+            name: for messages.
+            vertices: (V, 3) metres, any float dtype.
+            faces: (F, 3) indices into `vertices`.
+
+        Raises:
+            MeshError: nothing is left, or a number is not finite or out of range.
+        """
+        raw = cls(name, np.asarray(vertices), np.asarray(faces), closed=False)
+        merged, corner = _merge_vertices(raw.vertices)
+        triangles = corner[raw.faces]
+        # Judged before flat triangles go: a flat one may be all that joins two neighbours.
+        closed = _bounds_volume(triangles)
+        points = merged.astype(np.float64)
+        if closed:
+            triangles = _face_outwards(points, triangles)
+        a, b, c = points[triangles[:, 0]], points[triangles[:, 1]], points[triangles[:, 2]]
+        areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        triangles = triangles[areas > MIN_TRIANGLE_AREA_M2]
+        if not len(triangles):
+            raise MeshError(f"mesh {name}: expected triangles with an area, got {len(areas)} without")
+        used, compact = np.unique(triangles, return_inverse=True)
+        return cls(name, merged[used], compact.reshape(-1, 3).astype(np.int32), closed)
+
+    @cached_property
+    def bounds_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Smallest and largest corner (3,) each, metres, mesh frame."""
+        points = self.vertices.astype(np.float64)
+        return points.min(axis=0), points.max(axis=0)
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hash of the canonical bytes, as hex: equal geometry, equal hash."""
+        return hashlib.sha256(self.to_bytes()).hexdigest()
+
+    def to_bytes(self) -> bytes:
+        """The canonical bytes: a header of `CWM1`, closed, V, F (little-endian), then vertices and faces."""
+        return b"".join(
+            (
+                _HEADER.pack(_MAGIC, int(self.closed), len(self.vertices), len(self.faces)),
+                self.vertices.astype("<f4").tobytes(),
+                self.faces.astype("<i4").tobytes(),
+            )
+        )
+
+    @classmethod
+    def from_bytes(cls, data: bytes, name: str) -> TriangleMesh:
+        """Read canonical bytes, as they came over the network.
+
+        Raises:
+            MeshError: they are no mesh of ours, cut off, too many, or hold an index or number out of range.
+        """
+        if len(data) < _HEADER.size:
+            raise MeshError(f"mesh {name}: expected at least {_HEADER.size} bytes, got {len(data)}")
+        magic, closed, vertex_count, face_count = _HEADER.unpack_from(data)
+        if magic != _MAGIC or closed not in (0, 1):
+            raise MeshError(f"mesh {name}: expected bytes that begin with {_MAGIC!r}, got {data[:8]!r}")
+        if vertex_count > 3 * MAX_TRIANGLES or face_count > MAX_TRIANGLES:
+            raise MeshError(f"mesh {name}: expected at most {MAX_TRIANGLES} triangles, got {face_count}")
+        expected = _HEADER.size + 12 * vertex_count + 12 * face_count
+        if len(data) != expected:
+            raise MeshError(f"mesh {name}: expected {expected} bytes by its header, got {len(data)}")
+        vertices = np.frombuffer(data, "<f4", 3 * vertex_count, _HEADER.size).reshape(-1, 3)
+        faces = np.frombuffer(data, "<i4", 3 * face_count, _HEADER.size + 12 * vertex_count).reshape(-1, 3)
+        return cls(name, vertices, faces, bool(closed))
+
+    def transformed(self, T_new_mesh: Transform) -> TriangleMesh:
+        """The same triangles in another frame."""
+        points = self.vertices.astype(np.float64) @ T_new_mesh[:3, :3].T + T_new_mesh[:3, 3]
+        return TriangleMesh(self.name, points.astype(np.float32), self.faces, self.closed)
+
+
+def concatenated(name: str, meshes: list[TriangleMesh]) -> TriangleMesh:
+    """One mesh of several in one frame; closed when all of them are. Vertices are not merged across them."""
+    starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
+    return TriangleMesh(
+        name,
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]),
+        all(mesh.closed for mesh in meshes),
+    )
+
+
+def load_mesh(path: str | Path, scale: float | Sequence[float] = 1.0, name: str | None = None) -> TriangleMesh:
+    """Read an STL, OBJ, DAE or PLY file.
+
+    Scenes of several parts become one mesh by their own transforms. COLLADA's unit is applied and its
+    up axis ignored, as RViz does.
+
+    Args:
+        path: the file.
+        scale: metres per unit of the file, one number or one an axis (0.001 for a file in millimetres).
+        name: for messages; the file's stem when absent.
+
+    Raises:
+        MeshError: the file is missing, unreadable, of another kind, or holds no usable triangle; names the file.
+    """
+    file = Path(path)
+    factors = np.asarray(scale, dtype=np.float64)
+    if factors.shape not in ((), (3,)) or not np.isfinite(factors).all() or not factors.all():
+        raise MeshError(f"{file}: expected a scale of one or three numbers other than 0, got {scale}")
+    if file.suffix.lower() not in FILE_SUFFIXES:
+        raise MeshError(f"{file}: expected a mesh file ({', '.join(FILE_SUFFIXES)}), got {file.suffix or file.name!r}")
+    if not file.is_file():
+        raise MeshError(f"{file}: expected a mesh file, got {'a folder' if file.is_dir() else 'nothing there'}")
+    vertices, faces = _read_triangles(file)
+    if not len(faces):
+        raise MeshError(f"{file}: expected a mesh with triangles, got none")
+    if np.prod(np.broadcast_to(factors, 3)) < 0.0:
+        # A mirrored solid is inside out unless its triangles turn as well.
+        faces = faces[:, ::-1]
+    try:
+        return TriangleMesh.of_triangles(name or file.stem, vertices * factors, faces)
+    except MeshError as error:
+        raise MeshError(f"{file}: {error}") from error
+
+
+def box_mesh(name: str, size_m: ArrayLike) -> TriangleMesh:
+    """A box about the origin, `size_m` (3,) its edges."""
+    return _primitive(name, trimesh.creation.box(extents=np.asarray(size_m, dtype=np.float64)))
+
+
+def cylinder_mesh(name: str, radius_m: float, length_m: float) -> TriangleMesh:
+    """A cylinder about the origin along z."""
+    return _primitive(name, trimesh.creation.cylinder(radius=radius_m, height=length_m, sections=CIRCLE_SEGMENTS))
+
+
+def sphere_mesh(name: str, radius_m: float) -> TriangleMesh:
+    """A sphere about the origin."""
+    return _primitive(name, trimesh.creation.icosphere(subdivisions=3, radius=radius_m))
+
+
+def _primitive(name: str, shape: trimesh.Trimesh) -> TriangleMesh:
+    return TriangleMesh.of_triangles(name, np.asarray(shape.vertices), np.asarray(shape.faces))
+
+
+def _read_triangles(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices and faces of all parts of a file, in the file's unit (COLLADA: metres)."""
+    try:
+        scene = trimesh.load_scene(file, process=False, skip_materials=True)
+        parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
+        is_collada = file.suffix.lower() == ".dae"
+        unit_m = trimesh.units.unit_conversion(scene.units, "meters") if is_collada and scene.units else 1.0
+    # The readers raise whatever the damage happens to lead to: struct, index, value, XML and import errors.
+    except Exception as error:
+        raise MeshError(f"{file}: expected a readable mesh, got {type(error).__name__}: {error}") from error
+    vertices = [np.asarray(part.vertices, dtype=np.float64) * unit_m for part in parts]
+    faces = [np.asarray(part.faces, dtype=np.int64) for part in parts]
+    starts = np.cumsum([0] + [len(points) for points in vertices])
+    if not parts:
+        return np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
+    return np.concatenate(vertices), np.concatenate([part + starts[i] for i, part in enumerate(faces)])
+
+
+def _merge_vertices(vertices: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Distinct vertices (W, 3), and for each given one (V,) the index of its own."""
+    rounded = np.round(vertices.astype(np.float64) / MERGE_DISTANCE_M).astype(np.int64)
+    order = np.lexsort((rounded[:, 2], rounded[:, 1], rounded[:, 0]))
+    is_new = np.ones(len(order), dtype=bool)
+    is_new[1:] = (np.diff(rounded[order], axis=0) != 0).any(axis=1)
+    corner = np.empty(len(order), dtype=np.int64)
+    corner[order] = np.cumsum(is_new) - 1
+    return vertices[order[is_new]], corner
+
+
+def _bounds_volume(faces: NDArray[np.int64]) -> bool:
+    """Whether each edge is walked as often one way as the other, so that no surface ends or turns over."""
+    edges = np.concatenate((faces[:, (0, 1)], faces[:, (1, 2)], faces[:, (2, 0)]))
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    direction = np.where(edges[:, 0] < edges[:, 1], 1, -1)
+    order = np.lexsort((high, low))
+    low, high, direction = low[order], high[order], direction[order]
+    starts = np.flatnonzero(np.concatenate(([True], (np.diff(low) != 0) | (np.diff(high) != 0))))
+    return bool(len(edges)) and not np.add.reduceat(direction, starts).any()
+
+
+def _face_outwards(points: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Turn over the parts of a closed surface whose volume comes out negative."""
+    part = _connected_parts(len(points), faces)[faces[:, 0]]
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    six_volumes = np.bincount(part, weights=np.einsum("ij,ij->i", a, np.cross(b, c)))
+    return np.where((six_volumes < 0.0)[part][:, None], faces[:, ::-1], faces)
+
+
+def _connected_parts(vertex_count: int, faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """A label (V,) for each vertex, equal where triangles connect them."""
+    label = np.arange(vertex_count)
+    while True:
+        lowest = label[faces].min(axis=1)
+        spread = label.copy()
+        np.minimum.at(spread, faces.ravel(), np.repeat(lowest, 3))
+        # Following each label to its own label halves the remaining way, so that long parts take few rounds.
+        spread = np.minimum(spread, spread[spread])
+        if np.array_equal(spread, label):
+            return label
+        label = spread

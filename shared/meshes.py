@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -208,6 +208,20 @@ def load_mesh(path: str | Path, scale: float | Sequence[float] = 1.0, name: str 
         return TriangleMesh.of_triangles(name or file.stem, vertices * factors, faces)
     except MeshError as error:
         raise MeshError(f"{file}: {error}") from error
+
+
+def mesh_by_hash(meshes: Mapping[str, bytes], sha256: str, name: str) -> TriangleMesh:
+    """The mesh `name` out of canonical bytes that are filed under their hashes.
+
+    Raises:
+        MeshError: it is missing, its bytes have another hash, or they are malformed.
+    """
+    if sha256 not in meshes:
+        raise MeshError(f"mesh {name}: expected bytes with sha256 {sha256}, got none")
+    mesh = TriangleMesh.from_bytes(meshes[sha256], name)
+    if mesh.sha256 != sha256:
+        raise MeshError(f"mesh {name}: expected bytes with sha256 {sha256}, got {mesh.sha256}")
+    return mesh
 
 
 def box_mesh(name: str, size_m: ArrayLike) -> TriangleMesh:

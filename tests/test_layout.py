@@ -26,7 +26,8 @@ WALL_CLOCK_CALLS = {"now", "utcnow", "today"}
 LISTED = re.compile(r"^ {4}(\w+/?) +\S", re.MULTILINE)
 # In brackets, so that this page does not find itself.
 MACHINE = re.compile(
-    r"(?<![\w.$}])/(?:[h]ome|[U]sers)/\w|(?<![\w.$}])/[r]oot/|[p]ypi\.org|python[h]osted|[n]pmjs\.(?:org|com)|deb\.[d]ebian\.org"
+    r"(?<![\w.$}])/(?:(?:[h]ome|[U]sers)/\w|[r]oot/)"
+    r"|[p]ypi\.org|python[h]osted|[n]pmjs\.(?:org|com)|deb\.[d]ebian\.org"
 )
 
 Module = tuple[str, ...]
@@ -40,7 +41,7 @@ def listing(package: Path) -> list[str]:
 
 
 def modules(root: Path) -> Iterator[tuple[Path, Module]]:
-    """Every Python file of the packages, with its dotted name as a tuple; a package's is that of its folder."""
+    """Every Python file of the packages and its dotted name; an `__init__` has that of its folder."""
     for package in PACKAGES:
         for file in sorted((root / package).rglob("*.py")):
             parts = file.relative_to(root).with_suffix("").parts

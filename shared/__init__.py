@@ -12,6 +12,8 @@ In the order of the flow:
     kinematics  a robot's links at given joint positions (Algorithm 5)
     cell        the watched workspace: box, CAD, known objects, robot, board
     settings    what an operator may change while everything runs
+    configuration  YAML, environment and command line as one configuration
+    timebase    how far the master's clock is from a unit's
     messages    what units and master say to each other, as models
     wire        those messages as bytes
 """

@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What units, master, robot and operators say to each other.
+
+Times are integers of nanoseconds: `_at_ns` of a unit by its CLOCK_MONOTONIC, of the master and of
+joints by the master's. Every text, list and array is bounded, since anyone on the network may send one.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from shared.camera import Intrinsics
+from shared.errors import InputError
+from shared.lattice import MAX_AXIS, Lattice
+from shared.settings import Settings
+from shared.timebase import Exchange
+from shared.transforms import Transform, validated
+
+CONTRACT_VERSION = 1
+"""Rises when a unit of the old contract and a master of the new one can no longer work together."""
+
+MAX_TEXT = 200
+"""Enough for a serial, a version or one sentence; keeps tables and logs readable."""
+
+MAX_JOINTS = 32
+"""More than two arms on a track with grippers have."""
+
+MAX_VOXELS = 2**18
+"""In one update: a wall that is in no CAD, 5 m by 5 m at 10 mm, still fits; 1 MiB on the wire."""
+
+MAX_SEEN_BYTES = 4096
+"""Of one seen report, compressed; coarser blocks are reported when it would be more."""
+
+MAX_COMMANDS = 16
+"""Pending for one unit; an operator who clicks on is told to wait."""
+
+MAX_JOINT_SAMPLES = 32
+"""In one answer: a slow unit at 5 fps gets all that it needs at one sample in 8 ms."""
+
+Text = Annotated[str, Field(max_length=MAX_TEXT)]
+Nanoseconds = Annotated[int, Field(ge=0, lt=2**63)]
+Counter = Annotated[int, Field(ge=0, lt=2**63)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+JointValues = Annotated[tuple[float, ...], Field(max_length=MAX_JOINTS)]
+Matrix = tuple[
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+]
+State = Literal["uncalibrated", "live", "stale", "blind", "moved"]
+
+
+class Message(BaseModel):
+    """Frozen; unknown names, NaN and infinity are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Versions(Message):
+    """Counters of the master that rise with each change; a unit tells which ones it works with."""
+
+    settings: Counter = 0
+    lattice: Counter = 0
+    cell: Counter = 0
+    pose: Counter = 0
+
+
+class LatticeDescription(Message):
+    """A `shared.lattice.Lattice` as plain numbers."""
+
+    origin_m: tuple[float, float, float]
+    voxel_size_m: float = Field(gt=0.0)
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def of(cls, lattice: Lattice) -> LatticeDescription:
+        """Describe a lattice."""
+        return cls(origin_m=lattice.origin_m, voxel_size_m=lattice.voxel_size_m, shape=lattice.shape)
+
+    def lattice(self) -> Lattice:
+        """The lattice described.
+
+        Raises:
+            InputError: there can be no such lattice.
+        """
+        return Lattice(self.origin_m, self.voxel_size_m, self.shape)
+
+
+class CellReference(Message):
+    """Which cell the master watches; `sha256` of its document, by which a unit keeps it on disk."""
+
+    name: Text
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+
+
+class JointSample(NamedTuple):
+    """The robot's joints at one time by the master's clock: positions (n,) rad (m if prismatic), velocities per s."""
+
+    at_ns: Nanoseconds
+    positions: JointValues
+    velocities: JointValues | None
+
+
+class Command(Message):
+    """Something that an operator asked a unit to do; the unit names the `id` in a later update when it is done."""
+
+    id: Counter
+    verb: Literal["learn_background", "drop_background"]
+
+
+class InitializeRequest(Message):
+    """A unit with its camera asks for its slot (Algorithm 8)."""
+
+    contract: int = Field(ge=0, lt=2**31)
+    serial: str = Field(min_length=1, max_length=MAX_TEXT, description="Serial number of the camera.")
+    model: Text = ""
+    intrinsics: Intrinsics
+    software: Text = ""
+    boot_id: Text = Field(default="", description="Changes when the unit's monotonic clock starts anew.")
+    sent_at_ns: Nanoseconds
+
+
+class InitializeAnswer(Message):
+    """The slot, and all that a unit needs to begin."""
+
+    id: Counter
+    session: Counter
+    versions: Versions
+    settings: Settings
+    lattice: LatticeDescription
+    cell: CellReference
+    T_world_camera: Matrix | None = None
+    board: dict[str, Any] | None = None
+    joints: tuple[JointSample, ...] = Field(default=(), max_length=MAX_JOINT_SAMPLES)
+    received_at_ns: Nanoseconds
+    answered_at_ns: Nanoseconds
+
+
+class SeenReport(Message):
+    """Which blocks of the cell a frame looks through.
+
+    One bit each in C order `(ix*ny + iy)*nz + iz`, from the lattice's origin, little-endian bits, zlib.
+    """
+
+    block_size_m: float = Field(gt=0.0, le=1000.0)
+    shape: tuple[
+        Annotated[int, Field(ge=1, le=MAX_AXIS)],
+        Annotated[int, Field(ge=1, le=MAX_AXIS)],
+        Annotated[int, Field(ge=1, le=MAX_AXIS)],
+    ]
+    bits: bytes = Field(max_length=MAX_SEEN_BYTES)
+
+
+class Health(Message):
+    """How far a unit's view can be trusted, with the frame that it tells of."""
+
+    valid_share: Share = Field(default=0.0, description="Share of the pixels that measured anything.")
+    agreeing_share: Share = Field(
+        default=0.0, description="Share of the measured pixels before a known static surface that fit it."
+    )
+    residual_share: float = Field(
+        default=0.0, ge=-1.0, le=1.0, description="Median of measured less expected depth, in parts of the margin."
+    )
+    static_share: Share = Field(default=0.0, description="Share of the pixels before a known static surface.")
+    process_ms: float = Field(default=0.0, ge=0.0, description="Time from a frame to its voxels.")
+    frame: Counter = Field(default=0, description="Number of the frame.")
+    trouble: Text | None = Field(default=None, description="What is wrong at the unit, in one sentence.")
+
+
+class UpdateRequest(Message):
+    """What a unit reports of its newest frame (Algorithm 8)."""
+
+    id: Counter
+    session: Counter
+    sequence: Counter
+    captured_at_ns: Nanoseconds | None = Field(default=None, description="Absent: there is no frame yet.")
+    sent_at_ns: Nanoseconds
+    exchange: Exchange | None = Field(default=None, description="The four times of the exchange before.")
+    versions: Versions = Field(description="What the voxels were made with.")
+    keys: bytes = Field(default=b"", max_length=4 * MAX_VOXELS, description="Ascending little-endian uint32.")
+    seen: SeenReport | None = Field(default=None, description="Absent: as it was in the update before.")
+    health: Health = Health()
+    joints_until_ns: Nanoseconds = Field(default=0, description="The newest joints that the unit has.")
+    done: tuple[Counter, ...] = Field(default=(), max_length=MAX_COMMANDS)
+
+
+class UpdateAnswer(Message):
+    """What a unit needs next. Settings, lattice, cell and pose only where the unit's version is another."""
+
+    versions: Versions
+    received_at_ns: Nanoseconds
+    answered_at_ns: Nanoseconds
+    joints: tuple[JointSample, ...] = Field(default=(), max_length=MAX_JOINT_SAMPLES)
+    commands: tuple[Command, ...] = Field(default=(), max_length=MAX_COMMANDS)
+    settings: Settings | None = None
+    lattice: LatticeDescription | None = None
+    cell: CellReference | None = None
+    T_world_camera: Matrix | None = None
+
+
+class PoseRequest(Message):
+    """Where a unit's camera is: `T_world_camera` (4, 4), optical frame."""
+
+    T_world_camera: Matrix
+    origin: Literal["configured", "board", "refined", "operator", "source"] = "operator"
+
+    @field_validator("T_world_camera")
+    @classmethod
+    def _rigid(cls, value: Matrix) -> Matrix:
+        validated(value, "T_world_camera")
+        return value
+
+
+class PoseAnswer(Message):
+    """The version that the pose has now."""
+
+    pose: Counter
+
+
+class JointsRequest(Message):
+    """`PUT /robot/joints`: positions in rad (m if prismatic); without a time they count from their arrival."""
+
+    positions: JointValues
+    velocities: JointValues | None = None
+    at_ns: Nanoseconds | None = Field(default=None, description="By the master's clock, see `GET /robot`.")
+
+
+class RobotAnswer(Message):
+    """`GET /robot`: `fresh`, `stale` (silent for too long), `silent` (never reported), or `none` in this cell."""
+
+    state: Literal["fresh", "stale", "silent", "none"]
+    reason: Text = ""
+    joint_names: tuple[str, ...]
+    age_s: float | None
+    now_ns: Nanoseconds
+    joints: tuple[JointSample, ...]
+
+
+class UnitRow(Message):
+    """One unit in `GET /units`."""
+
+    id: Counter
+    ip: str
+    serial: str
+    model: str
+    software: str
+    state: State
+    reason: str
+    age_s: float | None = Field(description="Since the capture of its last frame.")
+    arrival_age_s: float | None = Field(description="Since its last update arrived.")
+    clock_uncertainty_ms: float | None
+    fps: float
+    voxels: int
+    process_ms: float
+    frame_number: int
+    health: Health
+    T_world_camera: Matrix | None
+    versions: Versions
+
+
+class VoxelsAnswer(Message):
+    """`GET /voxels`: the merged map. `voxels` are indices (N, 3), centres (N, 3) in m or keys (N,), as asked for."""
+
+    lattice: LatticeDescription
+    lattice_version: Counter
+    voxels: list[Any]
+    witnesses: list[int] = Field(description="How many live units report each voxel.")
+    complete: bool = Field(description="False whenever a voxel's absence proves nothing.")
+    reasons: list[str] = Field(description="Why it is not complete.")
+    oldest_view_age_s: float | None
+    units_live: int
+    now_ns: Nanoseconds
+    unseen: dict[str, Any] | None = None
+
+
+def matrix_of(transform: Transform) -> Matrix:
+    """A (4, 4) transform as nested tuples of numbers.
+
+    Raises:
+        InputError: it is not (4, 4).
+    """
+    if transform.shape != (4, 4):
+        raise InputError(f"transform: expected shape (4, 4), got {transform.shape}")
+    a, b, c, d = (tuple(float(value) for value in row) for row in transform)
+    return a, b, c, d  # type: ignore[return-value]

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages as bytes, and back; whatever is wrong with bytes from the network is one `WireError`.
+
+The body of `/update` is a msgpack map of the fields of `UpdateRequest` that are not at their default,
+
+    id, session, sequence, sent_at_ns   integers, 1 to 9 bytes each
+    captured_at_ns, joints_until_ns     integers of 9 bytes
+    exchange                            4 integers, 37 bytes
+    versions                            map of 4 small integers, 32 bytes
+    keys                                binary, 4 bytes a voxel: ascending little-endian uint32
+    seen                                map, only when it changed: at most 4 kB (see `pack_seen`)
+    health                              map, some 60 bytes
+
+and its answer those of `UpdateAnswer`, where each joint sample is `[at_ns, positions, velocities]`
+with little-endian float32 as binary. Both with all their HTTP headers stay within 4 bytes a voxel + 800.
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any, TypeVar
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ValidationError
+
+from shared.configuration import sentence
+from shared.errors import InputError, WireError
+from shared.messages import (
+    MAX_SEEN_BYTES,
+    MAX_VOXELS,
+    JointSample,
+    SeenReport,
+    UpdateAnswer,
+    UpdateRequest,
+)
+
+MEDIA_TYPE = "application/msgpack"
+
+MAX_FIXED_BYTES = 4096
+"""Of an update without keys and seen report: its numbers, names and one sentence of trouble."""
+
+MAX_UPDATE_BYTES = 4 * MAX_VOXELS + MAX_SEEN_BYTES + MAX_FIXED_BYTES
+
+MAX_ANSWER_BYTES = 2**20
+"""Of what a master answers to a unit, meshes apart; a cell's document is the largest."""
+
+MAX_SEEN_BLOCKS = 2**22
+"""A hall of 64 m by 64 m by 10 m in blocks of 100 mm; half a MiB of bits."""
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def encode(message: BaseModel) -> bytes:
+    """Any message as msgpack, without the fields that are None."""
+    packed: bytes = msgpack.packb(message.model_dump(exclude_none=True))
+    return packed
+
+
+def decode(model: type[Model], data: bytes, max_bytes: int = MAX_ANSWER_BYTES) -> Model:
+    """A message of the given model.
+
+    Raises:
+        WireError: too long, no msgpack, or a field is missing, unknown, of another type or out of range.
+    """
+    return _validated(model, _unpacked(data, max_bytes))
+
+
+def encode_update(update: UpdateRequest) -> bytes:
+    """The body of `POST /update`."""
+    packed: bytes = msgpack.packb(update.model_dump(exclude_defaults=True))
+    return packed
+
+
+def decode_update(data: bytes) -> UpdateRequest:
+    """An update from the body of `POST /update`; its keys are still bytes.
+
+    Raises:
+        WireError: as in `decode`.
+    """
+    return decode(UpdateRequest, data, MAX_UPDATE_BYTES)
+
+
+def encode_update_answer(answer: UpdateAnswer) -> bytes:
+    """The body of the answer to `POST /update`."""
+    fields = answer.model_dump(exclude_none=True)
+    fields["joints"] = [
+        (sample.at_ns, _floats(sample.positions), None if sample.velocities is None else _floats(sample.velocities))
+        for sample in answer.joints
+    ]
+    packed: bytes = msgpack.packb({name: value for name, value in fields.items() if value not in ((), [])})
+    return packed
+
+
+def decode_update_answer(data: bytes) -> UpdateAnswer:
+    """The answer to an update.
+
+    Raises:
+        WireError: as in `decode`.
+    """
+    fields = _unpacked(data, MAX_ANSWER_BYTES)
+    if isinstance(fields, dict) and "joints" in fields:
+        fields["joints"] = _joint_samples(fields["joints"])
+    return _validated(UpdateAnswer, fields)
+
+
+def keys_to_bytes(keys: NDArray[np.uint32]) -> bytes:
+    """Lattice keys (N,), ascending, as they travel.
+
+    Raises:
+        InputError: more than `MAX_VOXELS`.
+    """
+    if keys.size > MAX_VOXELS:
+        raise InputError(f"keys: expected at most {MAX_VOXELS} voxels in one update, got {keys.size}")
+    return keys.astype("<u4", copy=False).tobytes()
+
+
+def keys_from_bytes(data: bytes, cell_count: int) -> NDArray[np.uint32]:
+    """Lattice keys (N,) uint32 of a lattice of `cell_count` voxels; read-only, no copy.
+
+    Raises:
+        WireError: no whole number of keys, not ascending, or beyond the lattice.
+    """
+    if len(data) % 4:
+        raise WireError(f"keys: expected 4 bytes a voxel, got {len(data)} bytes")
+    keys = np.frombuffer(data, dtype="<u4")
+    if keys.size:
+        if int(keys[-1]) >= cell_count:
+            raise WireError(f"keys: expected keys below {cell_count}, got {int(keys[-1])}")
+        if not (keys[1:] > keys[:-1]).all():
+            raise WireError("keys: expected ascending keys, each once")
+    return keys
+
+
+def pack_seen(seen: NDArray[Any], block_size_m: float) -> SeenReport | None:
+    """A seen grid (nx, ny, nz), bool or 0 and 1, as a report; None when it would exceed `MAX_SEEN_BYTES`."""
+    bits = zlib.compress(np.packbits(seen, bitorder="little").tobytes())
+    if len(bits) > MAX_SEEN_BYTES:
+        return None
+    nx, ny, nz = seen.shape
+    return SeenReport(block_size_m=block_size_m, shape=(nx, ny, nz), bits=bits)
+
+
+def unpack_seen(report: SeenReport) -> NDArray[np.bool_]:
+    """The seen grid (nx, ny, nz) bool of a report.
+
+    Raises:
+        WireError: too many blocks, damaged, or not as many bits as its shape has blocks.
+    """
+    blocks = int(np.prod(report.shape, dtype=np.int64))
+    if blocks > MAX_SEEN_BLOCKS:
+        raise WireError(f"seen: expected at most {MAX_SEEN_BLOCKS} blocks, got {blocks}")
+    length = (blocks + 7) // 8
+    inflater = zlib.decompressobj()
+    try:
+        packed = inflater.decompress(report.bits, length + 1)
+    except zlib.error as error:
+        raise WireError(f"seen: damaged bits: {error}") from error
+    if len(packed) != length or not inflater.eof or inflater.unused_data:
+        raise WireError(f"seen: expected {length} bytes of bits for {blocks} blocks, got another count")
+    flat = np.unpackbits(np.frombuffer(packed, dtype=np.uint8), count=blocks, bitorder="little")
+    return flat.view(np.bool_).reshape(report.shape)
+
+
+def _unpacked(data: bytes, max_bytes: int) -> Any:
+    if len(data) > max_bytes:
+        raise WireError(f"message: expected at most {max_bytes} bytes, got {len(data)}")
+    try:
+        return msgpack.unpackb(data, use_list=False, strict_map_key=True)
+    except (ValueError, TypeError, msgpack.UnpackException) as error:
+        # All ways in which msgpack says that bytes are malformed; TypeError is an unhashable key.
+        raise WireError(f"message: no msgpack: {error or type(error).__name__}") from error
+
+
+def _validated(model: type[Model], fields: Any) -> Model:
+    try:
+        return model.model_validate(fields, strict=True)
+    except ValidationError as error:
+        raise WireError(sentence(error)) from error
+
+
+def _floats(values: tuple[float, ...]) -> bytes:
+    return np.asarray(values, dtype="<f4").tobytes()
+
+
+def _joint_samples(rows: Any) -> tuple[JointSample, ...]:
+    try:
+        return tuple(
+            JointSample(at_ns, _values(positions), None if velocities is None else _values(velocities))
+            for at_ns, positions, velocities in rows
+        )
+    except (TypeError, ValueError) as error:
+        raise WireError(f"joints: expected rows of time, positions, velocities: {error}") from error
+
+
+def _values(data: bytes) -> tuple[float, ...]:
+    return tuple(np.frombuffer(data, dtype="<f4").tolist())

@@ -12,7 +12,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
 BENCH_READY := $(VENV)/ready-bench
-TYPED := $(wildcard shared edge_unit master_server simulation benchmarks)
+TYPED := $(patsubst %/,%,$(dir $(wildcard $(addsuffix /__init__.py,shared edge_unit master_server simulation benchmarks))))
 
 # Recorded data, where it lies beside the checkout.
 ifneq ($(wildcard ../shared/data),)

@@ -31,6 +31,7 @@ MACHINE = re.compile(
 )
 
 Module = tuple[str, ...]
+Check = Callable[[Path], Iterator[str]]
 
 
 def listing(package: Path) -> list[str]:
@@ -132,11 +133,11 @@ def check_machine(root: Path) -> Iterator[str]:
                 yield f"{file.relative_to(root)}:{number}: names {found.group()}"
 
 
-CHECKS = (check_listings, check_order, check_packages, check_kernels, check_clock, check_machine)
+CHECKS: tuple[Check, ...] = (check_listings, check_order, check_packages, check_kernels, check_clock, check_machine)
 
 
 @pytest.mark.parametrize("check", CHECKS)
-def test_the_project_keeps(check: Callable[[Path], Iterator[str]]) -> None:
+def test_the_project_keeps(check: Check) -> None:
     problems = list(check(CHECKOUT))
     assert not problems, f"{check.__doc__}\n" + "\n".join(problems)
 
@@ -160,7 +161,7 @@ BAD = {
     "simulation/world.py": "import edge_unit.pipeline",
     "notes.md": "fine: ~/x, $HOME/x, a/root/b\nlies in /" + "home/anna/x\nfrom py" + "pi.org",
 }
-EXPECTED = {
+EXPECTED: dict[Check, list[str]] = {
     check_listings: [
         "edge_unit/__init__.py:1: does not list loose/",
         "edge_unit/loose/__init__.py:1: does not list part",
@@ -191,7 +192,7 @@ EXPECTED = {
 
 
 @pytest.mark.parametrize("check", CHECKS)
-def test_the_check_finds_what_is_wrong(check: Callable[[Path], Iterator[str]], tmp_path: Path) -> None:
+def test_the_check_finds_what_is_wrong(check: Check, tmp_path: Path) -> None:
     for name, text in BAD.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)

@@ -33,8 +33,10 @@ test: $(READY) libusb lint ## lint, then all tests but the slow ones; with SLOW=
 	@$(BIN)/python -m pytest -q $(if $(SLOW),,-m "not slow") $(ARGS)
 
 lint: $(READY) ## ruff and mypy
-	@$(BIN)/ruff check -q .
-	@$(if $(TYPED),$(BIN)/mypy --no-error-summary $(TYPED),)
+	@failed=0; \
+	$(BIN)/ruff check -q . || failed=1; \
+	$(if $(TYPED),$(BIN)/mypy --no-error-summary $(TYPED) || failed=1;) \
+	exit $$failed
 
 clean: ## takes out .venv and all caches
 	rm -rf $(VENV) build dist out .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -74,36 +74,45 @@ def nearest_over(
 def robot_band_raw(
     nearest_w: NDArray[np.float32],
     farthest_w: NDArray[np.float32],
-    first_row: int,
-    last_row: int,
-    first_column: int,
-    last_column: int,
+    rectangles: NDArray[np.int32],
     noise_per_m: float,
     depth_m: float,
     depth_scale_m: float,
     near_raw: NDArray[np.uint16],
     span_raw: NDArray[np.uint16],
 ) -> None:
-    """The band of raw depths in which a measurement belongs to the robot, inside a rectangle of the image.
+    """The band of raw depths in which a measurement belongs to the robot, inside the `rectangles` (M, 4).
 
     From the nearest padded surface less its noise margin to the farthest padded surface plus its margin plus
     `depth_m`: what stands behind the robot's silhouette is still seen. The band is stored as its lower end
     and its length, so that the filter needs one unsigned compare; where there is no robot the band is empty
     (lower end 65535). `nearest_w`, `farthest_w` (H, W) of 1/m; out (H, W).
     """
+    one, zero, top = np.float32(1.0), np.float32(0.0), np.float32(RAW_MAX)
     units = np.float32(1.0 / depth_scale_m)
     noise = np.float32(noise_per_m)
     behind = np.float32(depth_m)
-    for y in range(first_row, last_row + 1):
-        for x in range(first_column, last_column + 1):
-            w_near = nearest_w[y, x]
-            z_near = np.float32(1.0) / w_near
-            z_far = np.float32(1.0) / farthest_w[y, x]
-            near = (z_near - noise * z_near * z_near) * units
-            far = (z_far + noise * z_far * z_far + behind) * units
-            near = min(max(near, np.float32(0.0)), np.float32(65535.0))
-            far = min(max(far, np.float32(0.0)), np.float32(65535.0))
-            low = np.int32(near) if w_near > 0.0 else np.int32(65535)
-            high = np.int32(far) if w_near > 0.0 else np.int32(65535)
-            near_raw[y, x] = np.uint16(low)
-            span_raw[y, x] = np.uint16(max(high - low, 0))
+    for m in range(len(rectangles)):
+        first, last = rectangles[m, 2], rectangles[m, 3] + 1
+        for y in range(rectangles[m, 0], rectangles[m, 1] + 1):
+            for x in range(first, last):
+                w_near = nearest_w[y, x]
+                z_near = one / w_near
+                z_far = one / farthest_w[y, x]
+                near = min(max((z_near - noise * z_near * z_near) * units, zero), top)
+                far = min(max((z_far + noise * z_far * z_far + behind) * units, zero), top)
+                # Nothing drawn: w is 0, z infinite, and near is NaN; the compare below sends it to the top.
+                low = np.int32(near) if w_near > zero else np.int32(RAW_MAX)
+                high = np.int32(far) if w_near > zero else np.int32(RAW_MAX)
+                near_raw[y, x] = np.uint16(low)
+                span_raw[y, x] = np.uint16(max(high - low, 0))
+
+
+@kernel
+def clear_band(rectangles: NDArray[np.int32], near_raw: NDArray[np.uint16], span_raw: NDArray[np.uint16]) -> None:
+    """Make the robot's band empty inside the `rectangles` (M, 4)."""
+    for m in range(len(rectangles)):
+        for y in range(rectangles[m, 0], rectangles[m, 1] + 1):
+            for x in range(rectangles[m, 2], rectangles[m, 3] + 1):
+                near_raw[y, x] = np.uint16(RAW_MAX)
+                span_raw[y, x] = np.uint16(0)

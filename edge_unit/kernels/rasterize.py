@@ -219,13 +219,62 @@ def draw_mesh(
 
 
 @kernel
-def clear_rectangle(
+def draw_meshes(
+    vertices_m: NDArray[np.float32],
+    offsets: NDArray[np.float32],
+    faces: NDArray[np.int32],
+    vertex_starts: NDArray[np.int32],
+    face_starts: NDArray[np.int32],
+    closed: NDArray[np.bool_],
+    T_camera_mesh: NDArray[np.float32],
+    padding_m: NDArray[np.float32],
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    near_m: float,
+    screen: NDArray[np.float32],
+    corners: NDArray[np.float32],
+    polygon: NDArray[np.float64],
     nearest_w: NDArray[np.float32],
     farthest_w: NDArray[np.float32],
-    rectangle: NDArray[np.int32],
+    rectangles: NDArray[np.int32],
 ) -> None:
-    """Forget what was drawn inside `rectangle` (first and last row, first and last column)."""
-    for y in range(rectangle[0], rectangle[1] + 1):
-        for x in range(rectangle[2], rectangle[3] + 1):
-            nearest_w[y, x] = NOTHING_NEAREST
-            farthest_w[y, x] = NOTHING_FARTHEST
+    """Draw M meshes that lie one after the other in `vertices_m` and `faces`, each with its pose and padding.
+
+    Mesh m has the vertices `vertex_starts[m]:vertex_starts[m + 1]` and likewise faces, whose indices count from the
+    mesh's own first vertex. `T_camera_mesh` (M, 3, 4), `padding_m` (M,), `closed` (M,). `rectangles` (M, 4) is
+    set to the pixels that each mesh may have touched, empty (first > last) where it is not in view.
+    """
+    height, width = nearest_w.shape
+    for m in range(len(closed)):
+        rectangles[m, 0] = height
+        rectangles[m, 1] = -1
+        rectangles[m, 2] = width
+        rectangles[m, 3] = -1
+        first, last = vertex_starts[m], vertex_starts[m + 1]
+        draw_mesh(
+            vertices_m[first:last],
+            offsets[first:last],
+            faces[face_starts[m] : face_starts[m + 1]],
+            closed[m],
+            T_camera_mesh[m],
+            padding_m[m],
+            fx, fy, cx, cy, near_m,
+            screen, corners, polygon,
+            nearest_w, farthest_w, rectangles[m],
+        )  # fmt: skip
+
+
+@kernel
+def clear_rectangles(
+    nearest_w: NDArray[np.float32],
+    farthest_w: NDArray[np.float32],
+    rectangles: NDArray[np.int32],
+) -> None:
+    """Forget what was drawn inside the `rectangles` (M, 4): first and last row, first and last column."""
+    for m in range(len(rectangles)):
+        for y in range(rectangles[m, 0], rectangles[m, 1] + 1):
+            for x in range(rectangles[m, 2], rectangles[m, 3] + 1):
+                nearest_w[y, x] = NOTHING_NEAREST
+                farthest_w[y, x] = NOTHING_FARTHEST

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a mesh grows by a padding: per vertex, the direction and length of one metre of growth.
+
+Links that are inflated when they are loaded pad silhouette and depth in one render, and cost nothing per frame.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.meshes import TriangleMesh
+
+OFFSET_MAX = 2.0
+"""A corner's tip moves by at most this times the padding; the tip of a needle would run away."""
+
+RIDGE = 1e-3
+"""Weight of staying put: on a smooth surface it fixes the two directions that the faces leave free."""
+
+
+def vertex_offsets(mesh: TriangleMesh) -> NDArray[np.float32]:
+    """Offsets (V, 3) such that `vertices + padding * offsets` moves every face outward by about `padding`.
+
+    A mere mean of normals would leave the faces of a box at 58 % of the padding. Here each vertex solves, in the least
+    squares sense, `normal . offset = 1` for all faces that meet in it, weighted by their angle there.
+    """
+    corners = mesh.vertices.astype(np.float64)[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    equations = np.zeros((len(mesh.vertices), 3, 3))
+    targets = np.zeros((len(mesh.vertices), 3))
+    for k in range(3):
+        angle = _corner_angle(corners[:, k], corners[:, (k + 1) % 3], corners[:, (k + 2) % 3])
+        np.add.at(equations, mesh.faces[:, k], angle[:, None, None] * normals[:, :, None] * normals[:, None, :])
+        np.add.at(targets, mesh.faces[:, k], angle[:, None] * normals)
+    weight = np.trace(equations, axis1=1, axis2=2)
+    equations += (RIDGE * np.maximum(weight, 1e-12))[:, None, None] * np.eye(3)
+    offsets = np.linalg.solve(equations, targets[:, :, None])[:, :, 0]
+    length = np.linalg.norm(offsets, axis=1, keepdims=True)
+    return (offsets * np.minimum(1.0, OFFSET_MAX / np.maximum(length, 1e-12))).astype(np.float32)
+
+
+def _corner_angle(at: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angle (F,) in rad at the corners `at` (F, 3) between the sides to `one` and to `other`."""
+    a, b = one - at, other - at
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ij,ij->i", a, b))

@@ -1,0 +1,345 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The method, one line a stage: from a depth image to the obstacle voxels of the cell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edge_unit.expected_depth import BareRobot, RobotLayer, StaticLayer
+from edge_unit.health import Health, HealthCheck
+from edge_unit.kernels import foreground, limits
+from edge_unit.reference import Reference, ReferenceLearner
+from edge_unit.visibility import SeenBlocks, Visibility
+from edge_unit.voxels import Voxelizer, Voxels
+from shared.camera import Intrinsics
+from shared.cell import Cell
+from shared.clock import stage_ns
+from shared.errors import InputError
+from shared.lattice import Lattice
+from shared.settings import FilterSettings
+from shared.transforms import Transform, inverse, validated
+
+EDGE_RADIUS_WIDTH_PX = 1280
+"""`edge_radius_px` is given for this width; an edge's blur covers the same angle at every resolution."""
+
+MASK_ALIGNMENT = 8
+"""Rows of the mask are padded to whole words, so that eight empty pixels are skipped at once."""
+
+
+@dataclass(frozen=True)
+class StageTimes:
+    """Nanoseconds that the stages of the last frame took."""
+
+    expected_ns: int
+    filter_ns: int
+    voxelize_ns: int
+    density_ns: int
+
+    @property
+    def total_ns(self) -> int:
+        """All stages together."""
+        return self.expected_ns + self.filter_ns + self.voxelize_ns + self.density_ns
+
+
+class DepthPipeline:
+    """One camera's filter. Not for use from several threads at once.
+
+    All that changes while it runs (`apply`, `move`, `use_cell`, `use`) takes effect with the next frame.
+    """
+
+    def __init__(
+        self,
+        intrinsics: Intrinsics,
+        T_world_camera: ArrayLike,
+        cell: Cell,
+        settings: FilterSettings | None = None,
+    ) -> None:
+        """Prepare everything that does not depend on a frame.
+
+        Args:
+            intrinsics: of the depth camera.
+            T_world_camera: (4, 4) pose of its optical frame in the cell.
+            cell: the watched workspace.
+            settings: defaults when left out.
+
+        Raises:
+            InputError: the pose is no rigid transform, or the lattice would be too large.
+        """
+        self.intrinsics = intrinsics
+        self.cell = cell
+        self.settings = settings or FilterSettings()
+        self.T_world_camera = validated(T_world_camera, "T_world_camera")
+        self.reference: Reference | None = None
+        self.last = StageTimes(0, 0, 0, 0)
+        stride = -(-intrinsics.width // MASK_ALIGNMENT) * MASK_ALIGNMENT
+        self._mask = np.zeros((intrinsics.height, stride), np.uint8)
+        self._limit_raw = np.empty(intrinsics.shape, np.uint16)
+        self._scratch_raw = np.empty((2, *intrinsics.shape), np.uint16)
+        self._unlearned = np.full(intrinsics.shape, np.nan, np.float32)
+        self._depth_raw = np.zeros(intrinsics.shape, np.uint16)
+        self._health = HealthCheck(intrinsics)
+        self.use_cell(cell)
+
+    # ------------------------------------------------------------------ what a frame goes through
+
+    def process(
+        self, depth: NDArray[np.uint16], joints: ArrayLike | None, *, joint_uncertainty_rad: ArrayLike = 0.0
+    ) -> Voxels:
+        """Obstacle voxels of one frame.
+
+        Args:
+            depth: (H, W) uint16 in units of depth_scale_m, 0 where nothing was measured.
+            joints: (n,) rad (m where prismatic) at the frame's time; None when unknown: then the robot is
+                reported, not filtered.
+            joint_uncertainty_rad: how far each joint may be off, one number or (n,); it widens the padding.
+
+        Raises:
+            InputError: depth or joints have the wrong type, shape or values.
+        """
+        depth_raw = self.intrinsics.check_depth(depth)
+        started = stage_ns()
+        self._place_robot(joints, joint_uncertainty_rad)
+        expected = stage_ns()
+        self._filter(depth_raw)
+        filtered = stage_ns()
+        found = self._voxelizer.count(depth_raw, self._mask)
+        counted = stage_ns()
+        voxels = self._voxelizer.keep_dense(found)
+        finished = stage_ns()
+        self.last = StageTimes(expected - started, filtered - expected, counted - filtered, finished - counted)
+        return voxels
+
+    def foreground(
+        self, depth: NDArray[np.uint16], joints: ArrayLike | None, *, joint_uncertainty_rad: ArrayLike = 0.0
+    ) -> NDArray[np.bool_]:
+        """The pixels (H, W) that survive the filter; arguments and errors as in `process`."""
+        depth_raw = self.intrinsics.check_depth(depth)
+        self._place_robot(joints, joint_uncertainty_rad)
+        self._filter(depth_raw)
+        return self._mask[:, : self.intrinsics.width].astype(np.bool_)
+
+    def expected_depth(
+        self, joints: ArrayLike | None, *, joint_uncertainty_rad: ArrayLike = 0.0
+    ) -> NDArray[np.float32]:
+        """Depth (H, W) in metres of the nearest known surface, unpadded; inf where nothing is known.
+
+        Without joints the robot is not known. The uncertainty pads the filter only, never what is expected.
+        """
+        nearest_m = self._static_depth_m.copy()
+        if self.cell.robot is not None and joints is not None:
+            self._check_uncertainty(joint_uncertainty_rad)
+            w = self._bare_robot.nearest_w(self._T_camera_link(joints))
+            np.divide(1.0, w, out=self._divided, where=w > 0.0)
+            np.minimum(nearest_m, self._divided, out=nearest_m, where=w > 0.0)
+        return nearest_m
+
+    def seen(self) -> SeenBlocks:
+        """The blocks of the cell that the last frame looked through."""
+        return self._visibility.look(
+            self._depth_raw, self._limit_raw, self._robot.near_raw, self.settings.seen_share_min
+        )
+
+    def health(self) -> Health:
+        """How well the last frame fits what is known."""
+        return self._health.check(self._depth_raw, self._static_depth_m, self._robot.near_raw, self.settings)
+
+    # ------------------------------------------------------------------ learning the empty cell
+
+    def learn(self, frames: Iterable[tuple[NDArray[np.uint16], ArrayLike | None]]) -> Reference:
+        """Learn the static layer from frames of the empty cell; `use` makes it count.
+
+        Args:
+            frames: pairs of depth (H, W) uint16 and joints (n,).
+
+        Raises:
+            InputError: there was no frame, or a frame of a cell with a robot came without joints.
+        """
+        learner = self.learner()
+        for depth, joints in frames:
+            self.learn_frame(learner, depth, joints)
+        return learner.reference()
+
+    def learner(self) -> ReferenceLearner:
+        """A learner for this camera, to be fed with `learn_frame`."""
+        return ReferenceLearner(self.intrinsics, self._noise_per_m, self.settings.range_max_m)
+
+    def learn_frame(self, learner: ReferenceLearner, depth: NDArray[np.uint16], joints: ArrayLike | None) -> None:
+        """Add one frame of the empty cell to `learner`; arguments and errors as in `learn`.
+
+        The robot is left out by its own padded render, but for the links that never move: they belong to what stands
+        still, and leaving them out would leave an unlearned ring around the base.
+        """
+        depth_raw = self.intrinsics.check_depth(depth)
+        if self.cell.robot is not None and joints is None:
+            raise InputError("learn: expected joints with every frame, for the robot must not be learned as background")
+        self._place_robot(joints, 0.0, hidden=self._fixed_links)
+        learner.add(depth_raw, self._robot.near_raw, self._robot.span_raw)
+
+    def use(self, reference: Reference | None) -> None:
+        """From now on `reference` is part of the static layer; None takes it out.
+
+        Raises:
+            InputError: it was learned by a camera of another resolution.
+        """
+        if reference is not None and reference.depth_m.shape != self.intrinsics.shape:
+            raise InputError(
+                f"reference: expected images of {self.intrinsics.shape} (height, width), got {reference.depth_m.shape}"
+            )
+        self.reference = reference
+        self._renew_static()
+
+    # ------------------------------------------------------------------ what may change while it runs
+
+    @property
+    def lattice(self) -> Lattice:
+        """On which voxels are reported."""
+        return self._voxelizer.lattice
+
+    def apply(self, settings: FilterSettings) -> None:
+        """Work with other settings from now on.
+
+        Raises:
+            InputError: the lattice would be too large; the old settings stay.
+        """
+        voxelizer = Voxelizer(self.intrinsics, self.T_world_camera, self.cell.lattice(settings.voxel_size_m), settings)
+        visibility = self._look_from(self.T_world_camera, settings)
+        self.settings, self._voxelizer, self._visibility = settings, voxelizer, visibility
+        self._robot.forget()
+        self._renew_static()
+
+    def move(self, T_world_camera: ArrayLike, *, refined: bool = False) -> None:
+        """The camera's pose is another from now on.
+
+        What was learned belonged to the old place and is void, unless the pose was only `refined`: then the camera
+        did not move, we merely know better where it stands.
+
+        Raises:
+            InputError: the pose is no rigid transform; the old one stays.
+        """
+        self.T_world_camera = validated(T_world_camera, "T_world_camera")
+        if not refined:
+            self.reference = None
+        self._voxelizer.place(self.T_world_camera)
+        self._visibility.place(self.T_world_camera)
+        self._robot.forget()
+        self._draw_cad()
+        self._renew_static()
+
+    def use_cell(self, cell: Cell) -> None:
+        """The cell is another from now on, or its known objects stand elsewhere."""
+        voxelizer = Voxelizer(
+            self.intrinsics, self.T_world_camera, cell.lattice(self.settings.voxel_size_m), self.settings
+        )
+        self.cell = cell
+        self._voxelizer = voxelizer
+        self._visibility = self._look_from(self.T_world_camera, self.settings)
+        self._cad = StaticLayer(self.intrinsics, [placed.mesh for placed in (*cell.static, *cell.objects)])
+        self._robot = RobotLayer(self.intrinsics, cell.robot)
+        self._bare_robot = BareRobot(self.intrinsics, cell.robot)
+        self._divided = np.empty(self.intrinsics.shape, np.float32)
+        links = cell.robot.links if cell.robot else ()
+        self._fixed_links = np.array([not link.moving for link in links], np.bool_)
+        self._draw_cad()
+        self._renew_static()
+
+    # ------------------------------------------------------------------ the stages
+
+    def _place_robot(
+        self, joints: ArrayLike | None, joint_uncertainty_rad: ArrayLike, hidden: NDArray[np.bool_] | None = None
+    ) -> None:
+        """Draw the padded robot as it stood when the frame was taken."""
+        robot = self.cell.robot
+        if robot is None:
+            return
+        uncertainty = self._check_uncertainty(joint_uncertainty_rad)
+        if joints is None:
+            self._robot.forget()
+            return
+        padding_m = np.full(len(robot.links), self.settings.robot_padding_m)
+        if uncertainty.any():
+            padding_m += robot.displacement_m(uncertainty, joints)
+        self._robot.draw(
+            self._T_camera_link(joints),
+            padding_m.astype(np.float32),
+            self.settings.margin_noise_gain * self._noise_per_m,
+            self.settings.robot_depth_m,
+            hidden,
+        )
+
+    def _filter(self, depth_raw: NDArray[np.uint16]) -> None:
+        """Mark what is nearer than all that stands still, and not robot."""
+        self._depth_raw = depth_raw
+        foreground.foreground_mask(
+            depth_raw,
+            self._limit_raw,
+            self._robot.near_raw,
+            self._robot.span_raw,
+            self._robot.rows,
+            max(int(np.ceil(self.settings.range_min_m / self.intrinsics.depth_scale_m)), 1),
+            self._mask,
+        )
+
+    def _draw_cad(self) -> None:
+        placed = (*self.cell.static, *self.cell.objects)
+        self._cad.draw(self.T_world_camera, [each.T_world_mesh for each in placed])
+
+    def _renew_static(self) -> None:
+        """Limits of all that stands still: CAD and what was learned, less margins, nearest over the blur of an edge."""
+        settings, camera = self.settings, self.intrinsics
+        learned = self.reference
+        reference_m = learned.depth_m if learned else self._unlearned
+        spread_m = learned.spread_m if learned else self._unlearned
+        raw, scratch = self._scratch_raw
+        limits.static_limit_raw(
+            self._cad.nearest_w,
+            reference_m,
+            spread_m,
+            settings.margin_base_m,
+            settings.margin_noise_gain * self._noise_per_m,
+            settings.reference_margin_base_m,
+            settings.reference_spread_gain,
+            settings.range_max_m,
+            camera.depth_scale_m,
+            raw,
+        )
+        radius_px = round(settings.edge_radius_px * camera.width / EDGE_RADIUS_WIDTH_PX)
+        limits.nearest_over(raw, radius_px, scratch, self._limit_raw)
+        w = self._cad.nearest_w
+        cad_m = np.full(camera.shape, np.inf, np.float32)
+        np.divide(1.0, w, out=cad_m, where=w > 0.0)
+        self._static_depth_m = np.fmin(cad_m, reference_m)
+
+    def _look_from(self, T_world_camera: Transform, settings: FilterSettings) -> Visibility:
+        return Visibility(
+            self.intrinsics, T_world_camera, self.cell.box_min_m, self.cell.box_max_m, settings.seen_block_size_m
+        )
+
+    def _T_camera_link(self, joints: ArrayLike) -> NDArray[np.float64]:
+        """Poses (L, 4, 4) of the robot's links in the camera frame."""
+        robot = self.cell.robot
+        assert robot is not None
+        return inverse(self.T_world_camera) @ robot.T_world_base @ robot.link_poses(joints)
+
+    def _check_uncertainty(self, joint_uncertainty_rad: ArrayLike) -> NDArray[np.float64]:
+        """The uncertainty (n,) of each joint."""
+        robot = self.cell.robot
+        count = robot.joint_count if robot else 0
+        try:
+            uncertainty = np.asarray(joint_uncertainty_rad, np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"joint_uncertainty_rad: expected numbers, got {joint_uncertainty_rad!r}") from error
+        if uncertainty.shape not in ((), (count,)) or not (uncertainty >= 0.0).all():
+            raise InputError(
+                f"joint_uncertainty_rad: expected one number or {count}, none negative or NaN, "
+                f"got {uncertainty.tolist()}"
+            )
+        return np.broadcast_to(uncertainty, (count,))
+
+    @property
+    def _noise_per_m(self) -> float:
+        """The camera's noise `c` of `sigma(z) = c * z**2`, 1/m."""
+        return self.intrinsics.disparity_noise_m(self.settings.stereo_subpixel_px)

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which blocks of the cell the camera looks through now; all else is unseen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_unit.expected_depth import NEAR_PLANE_M
+from edge_unit.kernels import seen as kernels
+from shared.camera import Intrinsics
+from shared.lattice import Lattice
+from shared.transforms import Transform, inverse
+
+MAX_BLOCKS = 2**17
+"""16 kB of bits before compression; in a cell that needs more, the blocks are larger."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeenBlocks:
+    """Blocks of `lattice` that a frame looks through: `seen` (cell_count,) uint8, 0 or 1, in the order of the keys."""
+
+    seen: NDArray[np.uint8]
+    lattice: Lattice
+
+    def coarser(self) -> SeenBlocks:
+        """Blocks of twice the edge, seen only where all of their parts are; parts beyond the box do not count."""
+        nx, ny, nz = self.lattice.shape
+        shape = ((nx + 1) // 2, (ny + 1) // 2, (nz + 1) // 2)
+        padded = np.ones((2 * shape[0], 2 * shape[1], 2 * shape[2]), np.uint8)
+        padded[:nx, :ny, :nz] = self.seen.reshape(nx, ny, nz)
+        parts = padded.reshape(shape[0], 2, shape[1], 2, shape[2], 2)
+        larger = Lattice(self.lattice.origin_m, 2.0 * self.lattice.voxel_size_m, shape)
+        return SeenBlocks(parts.min(axis=(1, 3, 5)).reshape(-1), larger)
+
+    def packed(self) -> bytes:
+        """One bit a block, the first block in the lowest bit."""
+        return np.packbits(self.seen, bitorder="little").tobytes()
+
+
+class Visibility:
+    """Probes the blocks of a cell as one camera sees them."""
+
+    def __init__(
+        self,
+        intrinsics: Intrinsics,
+        T_world_camera: Transform,
+        box_min_m: NDArray[np.float64],
+        box_max_m: NDArray[np.float64],
+        block_size_m: float,
+    ) -> None:
+        self.lattice = Lattice.covering(box_min_m, box_max_m, block_size_m)
+        while self.lattice.cell_count > MAX_BLOCKS:
+            block_size_m *= 2.0
+            self.lattice = Lattice.covering(box_min_m, box_max_m, block_size_m)
+        self._intrinsics = intrinsics
+        self._blocks = np.empty(self.lattice.cell_count, np.int32)
+        self._views = np.empty((self.lattice.cell_count, 5), np.int32)
+        self._seen = np.zeros(self.lattice.cell_count, np.uint8)
+        self.place(T_world_camera)
+
+    def place(self, T_world_camera: Transform) -> None:
+        """The camera stands elsewhere from now on."""
+        camera = self._intrinsics
+        self._number = kernels.block_views(
+            np.array(self.lattice.shape, np.int32),
+            self.lattice.voxel_size_m,
+            inverse(T_world_camera),
+            np.array(self.lattice.origin_m),
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+            camera.width,
+            camera.height,
+            NEAR_PLANE_M,
+            camera.depth_scale_m,
+            self._blocks,
+            self._views,
+        )
+
+    def look(
+        self,
+        depth_raw: NDArray[np.uint16],
+        static_limit_raw: NDArray[np.uint16],
+        robot_near_raw: NDArray[np.uint16],
+        share_min: float,
+    ) -> SeenBlocks:
+        """The blocks that a frame looks through; images (H, W)."""
+        kernels.seen_blocks(
+            depth_raw,
+            static_limit_raw,
+            robot_near_raw,
+            self._blocks,
+            self._views,
+            self._number,
+            share_min,
+            self._seen,
+        )
+        return SeenBlocks(self._seen.copy(), self.lattice)

@@ -9,7 +9,9 @@ In the order of the flow:
     camera      pinhole intrinsics of a depth camera
     lattice     the voxel grid that the whole cell shares
     meshes      triangle meshes and their files
+    urdf        a URDF file as plain joints and meshes
     kinematics  a robot's links at given joint positions (Algorithm 5)
+    cell_file   `cell.yaml` as checked models, and the files that it names
     cell        the watched workspace: box, CAD, known objects, robot, board
     settings    what an operator may change while everything runs
     configuration  YAML, environment and command line as one configuration

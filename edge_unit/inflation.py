@@ -37,10 +37,10 @@ def vertex_offsets(mesh: TriangleMesh) -> NDArray[np.float32]:
     equations += (RIDGE * np.maximum(weight, 1e-12))[:, None, None] * np.eye(3)
     offsets = np.linalg.solve(equations, targets[:, :, None])[:, :, 0]
     length = np.linalg.norm(offsets, axis=1, keepdims=True)
-    return (offsets * np.minimum(1.0, OFFSET_MAX / np.maximum(length, 1e-12))).astype(np.float32)
+    return np.asarray(offsets * np.minimum(1.0, OFFSET_MAX / np.maximum(length, 1e-12)), dtype=np.float32)
 
 
 def _corner_angle(at: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angle (F,) in rad at the corners `at` (F, 3) between the sides to `one` and to `other`."""
     a, b = one - at, other - at
-    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ij,ij->i", a, b))
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ij,ij->i", a, b)))

@@ -28,7 +28,7 @@ EDGE_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Lattice:
-    """Voxels of edge `voxel_size_m` whose first corner is `origin_m` (3,) in the world; `shape` counts them per axis."""
+    """Voxels of edge `voxel_size_m` from the corner `origin_m` (3,) of the world; `shape` counts them per axis."""
 
     origin_m: tuple[float, float, float]
     voxel_size_m: float
@@ -62,7 +62,7 @@ class Lattice:
         low = np.asarray(box_min_m, dtype=np.float64)
         high = np.asarray(box_max_m, dtype=np.float64)
         if low.shape != (3,) or high.shape != (3,) or not (high > low).all():
-            raise InputError(f"box: expected min below max on three axes, got {box_min_m} to {box_max_m}")
+            raise InputError(f"box: expected min below max on three axes, got {low} to {high}")
         if not voxel_size_m > 0.0:
             raise InputError(f"voxel_size_m: expected a positive length, got {voxel_size_m}")
         counts = np.ceil((high - low) / voxel_size_m - EDGE_TOLERANCE).astype(np.int64)

@@ -47,25 +47,25 @@ class FilterSettings(BaseModel):
         default=0.04, ge=0.0, le=0.5, description="Constant part of the margin before CAD surfaces, in metres."
     )
     margin_noise_gain: float = Field(
-        default=3.0, ge=0.0, le=20.0, description="Standard deviations of stereo noise in the margin before CAD."
+        default=2.0, ge=0.0, le=20.0, description="Standard deviations of stereo noise in the margin before CAD."
     )
     stereo_subpixel_px: float = Field(
-        default=0.12, ge=0.01, le=1.0, description="Standard deviation of the camera's disparity, in pixels."
+        default=0.18, ge=0.01, le=1.0, description="Standard deviation of the camera's disparity, in pixels."
     )
     reference_margin_base_m: float = Field(
-        default=0.04, ge=0.0, le=0.5, description="Constant part of the margin before learned surfaces, in metres."
+        default=0.05, ge=0.0, le=0.5, description="Constant part of the margin before learned surfaces, in metres."
     )
     reference_spread_gain: float = Field(
-        default=3.0, ge=0.0, le=20.0, description="Standard deviations of a learned pixel in its margin."
+        default=5.0, ge=0.0, le=20.0, description="Standard deviations of a learned pixel in its margin."
     )
     edge_radius_px: int = Field(
-        default=5,
+        default=6,
         ge=0,
         le=15,
         description="Static limits take the nearest over this radius (pixels at 1280 wide, scaled to the camera).",
     )
     robot_padding_m: float = Field(
-        default=0.03, ge=0.0, le=0.3, description="How far the robot's links are inflated, in metres."
+        default=0.05, ge=0.0, le=0.3, description="How far the robot's links are inflated, in metres."
     )
     robot_depth_m: float = Field(
         default=0.15,

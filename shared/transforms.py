@@ -67,7 +67,8 @@ def rotation_about(axis: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
         return np.eye(3)
     x, y, z = direction / norm
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle_rad) * cross + (1.0 - np.cos(angle_rad)) * (cross @ cross)
+    rotation: NDArray[np.float64] = np.eye(3) + np.sin(angle_rad) * cross + (1.0 - np.cos(angle_rad)) * (cross @ cross)
+    return rotation
 
 
 def from_xyz_rpy(xyz_m: ArrayLike, rpy_rad: ArrayLike) -> Transform:

@@ -105,7 +105,7 @@ def robot_band_raw(
                 low = np.int32(near) if w_near > zero else np.int32(RAW_MAX)
                 high = np.int32(far) if w_near > zero else np.int32(RAW_MAX)
                 near_raw[y, x] = np.uint16(low)
-                span_raw[y, x] = np.uint16(max(high - low, 0))
+                span_raw[y, x] = np.uint16(high - low if high > low else 0)
 
 
 @kernel

@@ -4,6 +4,7 @@
 In the order of the flow:
 
     errors      the one tree of errors that the project raises
+    configuration  YAML, environment and command line as one configuration
     clock       the only place that reads the time
     transforms  rigid transforms `T_a_b` as (4, 4) matrices
     camera      pinhole intrinsics of a depth camera
@@ -14,7 +15,6 @@ In the order of the flow:
     cell_file   `cell.yaml` as checked models, and the files that it names
     cell        the watched workspace: box, CAD, known objects, robot, board
     settings    what an operator may change while everything runs
-    configuration  YAML, environment and command line as one configuration
     timebase    how far the master's clock is from a unit's
     messages    what units and master say to each other, as models
     wire        those messages as bytes

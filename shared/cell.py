@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from shared.cell_file import MAX_BODIES, BoardFile, DHFile, RobotFile, ShapeFile, named_file, read_cell_file
+from shared.configuration import sentence
 from shared.errors import CellError, InputError, KinematicsError, MeshError
 from shared.kinematics import DHJoint, Robot
 from shared.lattice import Lattice
@@ -65,6 +66,24 @@ class Board:
         pose = validated(self.T_world_board, "T_world_board")
         pose.flags.writeable = False
         object.__setattr__(self, "T_world_board", pose)
+
+    def to_document(self) -> dict[str, Any]:
+        """The board as a plain document."""
+        return {**vars(self), "T_world_board": self.T_world_board.tolist()}
+
+    @classmethod
+    def from_document(cls, document: object) -> Board:
+        """The board of `to_document`, as it came over the network.
+
+        Raises:
+            CellError: the document is malformed.
+        """
+        try:
+            return cls(**dict(_BoardDocument.model_validate(document)))
+        except ValidationError as error:
+            raise CellError(f"board document: {sentence(error)}") from error
+        except InputError as error:
+            raise CellError(f"board document: {error}") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +192,7 @@ class Cell:
             "static": [_body_document(body) for body in self.static],
             "objects": [_body_document(body) for body in self.objects],
             "robot": robot,
-            "board": None if self.board is None else _board_document(self.board),
+            "board": None if self.board is None else self.board.to_document(),
         }
         return document, meshes
 
@@ -193,12 +212,10 @@ class Cell:
                 tuple(_placed(body, meshes) for body in checked.static),
                 tuple(_placed(body, meshes) for body in checked.objects),
                 None if checked.robot is None else Robot.from_document(checked.robot, meshes),
-                None if checked.board is None else Board(**dict(checked.board)),
+                None if checked.board is None else Board.from_document(checked.board),
             )
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"]) or "document"
-            raise CellError(f"cell document: {where}: {first['msg']}, got {first['input']!r:.80}") from error
+            raise CellError(f"cell document: {sentence(error)}") from error
         except (InputError, MeshError, KinematicsError) as error:
             raise CellError(f"cell document: {error}") from error
 
@@ -231,19 +248,16 @@ class _CellDocument(_DocumentModel):
     static: list[_BodyDocument] = Field(max_length=MAX_BODIES)
     objects: list[_BodyDocument] = Field(max_length=MAX_BODIES)
     robot: dict[str, Any] | None
-    board: _BoardDocument | None
+    board: dict[str, Any] | None
 
 
 def _body_document(body: PlacedMesh) -> dict[str, Any]:
     return {"name": body.name, "mesh": body.mesh.sha256, "T_world_mesh": body.T_world_mesh.tolist()}
 
 
-def _board_document(board: Board) -> dict[str, Any]:
-    return {**vars(board), "T_world_board": board.T_world_board.tolist()}
-
-
 def _placed(body: _BodyDocument, meshes: Mapping[str, bytes]) -> PlacedMesh:
-    return PlacedMesh(body.name, mesh_by_hash(meshes, body.mesh, body.name), np.array(body.T_world_mesh))
+    pose = validated(body.T_world_mesh, f"{body.name} T_world_mesh")
+    return PlacedMesh(body.name, mesh_by_hash(meshes, body.mesh, body.name), pose)
 
 
 def _shape(file: Path, key: str, shape: ShapeFile, name: str) -> TriangleMesh:

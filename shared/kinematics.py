@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from shared.configuration import sentence
 from shared.errors import InputError, KinematicsError
 from shared.meshes import TriangleMesh, mesh_by_hash
 from shared.transforms import Transform, from_rotation_translation, identity, rotation_about, validated
@@ -214,10 +215,6 @@ class Robot:
         moved = np.where(self._is_turning, chord, off_by)
         return np.asarray((moved * self._link_chain).sum(axis=1))
 
-    def placed(self, T_world_base: ArrayLike) -> Robot:
-        """The same robot with its base elsewhere."""
-        return Robot(self.name, self.joint_names, self._motions, self._attachments, T_world_base)
-
     @classmethod
     def from_dh(
         cls,
@@ -369,9 +366,7 @@ class Robot:
                 checked.T_world_base,
             )
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            raise KinematicsError(f"robot document: {where}: {first['msg']}, got {first['input']!r}") from error
+            raise KinematicsError(f"robot document: {sentence(error)}") from error
         except InputError as error:
             raise KinematicsError(f"robot document: {error}") from error
 

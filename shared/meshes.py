@@ -200,7 +200,7 @@ def load_mesh(path: str | Path, scale: float | Sequence[float] = 1.0, name: str 
         raise MeshError(f"{file}: expected a mesh file, got {'a folder' if file.is_dir() else 'nothing there'}")
     vertices, faces = _read_triangles(file)
     if not len(faces):
-        raise MeshError(f"{file}: expected a mesh with triangles, got none")
+        raise MeshError(f"{file}: expected a mesh with triangles, got none: the file is empty or damaged")
     if np.prod(np.broadcast_to(factors, 3)) < 0.0:
         # A mirrored solid is inside out unless its triangles turn as well.
         faces = faces[:, ::-1]

@@ -74,10 +74,11 @@ class TriangleMesh:
             raise MeshError(f"mesh {self.name}: expected at most {MAX_TRIANGLES} triangles, got {len(faces)}")
         if not np.isfinite(vertices).all():
             raise MeshError(f"mesh {self.name}: expected finite coordinates, got NaN or infinity")
-        if np.abs(vertices).max() > MAX_COORDINATE_M:
+        farthest = float(np.abs(vertices).max(initial=0.0))
+        if farthest > MAX_COORDINATE_M:
             raise MeshError(
                 f"mesh {self.name}: expected coordinates within {MAX_COORDINATE_M:g} m, "
-                f"got {np.abs(vertices).max():.4g} m; for a file in millimetres set scale 0.001"
+                f"got {farthest:.4g} m; for a file in millimetres set scale 0.001"
             )
         if faces.min() < 0 or faces.max() >= len(vertices):
             raise MeshError(

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,6 +13,12 @@ from pydantic import BaseModel, ValidationError
 from shared.errors import ConfigError
 
 Model = TypeVar("Model", bound=BaseModel)
+
+SENTENCE_ITEMS = 3
+"""What is wrong beyond these is only counted."""
+
+SENTENCE_INPUT_CHARS = 60
+"""Enough to recognise a value; a megabyte of it helps nobody."""
 
 NESTING = "__"
 """`PREFIX_SOURCE__FPS=15` is `source.fps: 15`, since a single underscore is part of many names."""
@@ -65,15 +71,19 @@ def assignments(items: Iterable[str]) -> dict[str, str]:
 
 def sentence(error: ValidationError) -> str:
     """What is wrong with the first few fields of a model, in one line that names them and what came."""
+    return sentence_of(error.errors(include_url=False, include_context=False))
+
+
+def sentence_of(items: Sequence[Mapping[str, Any]]) -> str:
+    """The same, of pydantic's list of what is wrong."""
     parts = []
-    for item in error.errors(include_url=False, include_context=False)[:3]:
-        name = ".".join(str(part) for part in item["loc"])
-        came = repr(item["input"])
-        came = came if len(came) <= 60 else f"{came[:57]}..."
+    for item in items[:SENTENCE_ITEMS]:
+        name = ".".join(str(part) for part in item["loc"] if part != "body") or "value"
         what = item["msg"][:1].lower() + item["msg"][1:]
-        parts.append(f"{name}: {what}" if item["type"] == "missing" else f"{name or 'value'}: {what}, got {came}")
-    if error.error_count() > len(parts):
-        parts.append(f"and {error.error_count() - len(parts)} more")
+        came = f", got {repr(item['input'])[:SENTENCE_INPUT_CHARS]}" if item["type"] != "missing" else ""
+        parts.append(f"{name}: {what}{came}")
+    if len(items) > len(parts):
+        parts.append(f"and {len(items) - len(parts)} more")
     return "; ".join(parts)
 
 

@@ -13,6 +13,7 @@
       UplinkError           the exchange between unit and master failed
         MasterUnreachable   ... nobody answered
         MasterRefused       ... the master answered, and said no
+      Refusal               the master says no to a request: an HTTP status and one sentence
       JitCacheError         the directory for compiled kernels cannot be used
 
 Errors of libraries are mapped onto this tree where the library is called. `__main__` prints a
@@ -70,6 +71,14 @@ class MasterRefused(UplinkError):
     """The master answered with a refusal."""
 
     def __init__(self, message: str, status: int) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+class Refusal(CellwatchError):
+    """The master says no to a request."""
+
+    def __init__(self, status: int, message: str) -> None:
         super().__init__(message)
         self.status = status
 

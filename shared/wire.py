@@ -52,6 +52,21 @@ MAX_SEEN_BLOCKS = 2**22
 Model = TypeVar("Model", bound=BaseModel)
 
 
+def unpack(data: bytes, max_bytes: int) -> Any:
+    """Plain msgpack, arrays as tuples.
+
+    Raises:
+        WireError: longer than `max_bytes`, or malformed.
+    """
+    if len(data) > max_bytes:
+        raise WireError(f"message: expected at most {max_bytes} bytes, got {len(data)}")
+    try:
+        return msgpack.unpackb(data, use_list=False, strict_map_key=True)
+    except (ValueError, TypeError, msgpack.UnpackException) as error:
+        # All ways in which msgpack says that bytes are malformed; TypeError is an unhashable key.
+        raise WireError(f"message: no msgpack: {error or type(error).__name__}") from error
+
+
 def encode(message: BaseModel) -> bytes:
     """Any message as msgpack, without the fields that are None."""
     packed: bytes = msgpack.packb(message.model_dump(exclude_none=True))
@@ -64,7 +79,7 @@ def decode(model: type[Model], data: bytes, max_bytes: int = MAX_ANSWER_BYTES) -
     Raises:
         WireError: too long, no msgpack, or a field is missing, unknown, of another type or out of range.
     """
-    return _validated(model, _unpacked(data, max_bytes))
+    return _validated(model, unpack(data, max_bytes))
 
 
 def encode_update(update: UpdateRequest) -> bytes:
@@ -99,7 +114,7 @@ def decode_update_answer(data: bytes) -> UpdateAnswer:
     Raises:
         WireError: as in `decode`.
     """
-    fields = _unpacked(data, MAX_ANSWER_BYTES)
+    fields = unpack(data, MAX_ANSWER_BYTES)
     if isinstance(fields, dict) and "joints" in fields:
         fields["joints"] = _joint_samples(fields["joints"])
     return _validated(UpdateAnswer, fields)
@@ -161,16 +176,6 @@ def unpack_seen(report: SeenReport) -> NDArray[np.bool_]:
         raise WireError(f"seen: expected {length} bytes of bits for {blocks} blocks, got another count")
     flat = np.unpackbits(np.frombuffer(packed, dtype=np.uint8), count=blocks, bitorder="little")
     return flat.view(np.bool_).reshape(report.shape)
-
-
-def _unpacked(data: bytes, max_bytes: int) -> Any:
-    if len(data) > max_bytes:
-        raise WireError(f"message: expected at most {max_bytes} bytes, got {len(data)}")
-    try:
-        return msgpack.unpackb(data, use_list=False, strict_map_key=True)
-    except (ValueError, TypeError, msgpack.UnpackException) as error:
-        # All ways in which msgpack says that bytes are malformed; TypeError is an unhashable key.
-        raise WireError(f"message: no msgpack: {error or type(error).__name__}") from error
 
 
 def _validated(model: type[Model], fields: Any) -> Model:

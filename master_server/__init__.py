@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The master: every unit posts to it, and it tells anyone who asks where something unknown stands.
+
+In the order of the flow:
+
+    config       the master's own configuration
+    access       who may do what: two tokens
+    robot        the robot's joints, as a short history
+    registry     the units' slots and how far each can be trusted (Algorithm 8)
+    coverage     what the units look through, united
+    merge        the units' voxels, merged (Algorithm 9)
+    master       all of that held together, without a network
+    routes/      the same as HTTP
+    app          the web application, assembled
+    __main__     the command line
+"""

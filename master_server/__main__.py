@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`master-server --cell CELL.YAML`: serve one cell until told to stop."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import logging
+import os
+import socket
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+
+from master_server.access import Role, load_access, token_file
+from master_server.app import make_app
+from master_server.config import ENVIRONMENT_PREFIX, MasterConfig
+from master_server.master import Master
+from shared.cell import Cell
+from shared.configuration import assignments, load
+from shared.errors import CellwatchError, ConfigError
+
+logger = logging.getLogger("master_server")
+
+STOP_S = 1
+"""Whole seconds that open requests are given when told to stop; a service manager counts on two in all."""
+
+BACKLOG = 256
+"""Units that connect in the same moment, as after a power cut, with room to spare."""
+
+ANY_ADDRESS = ("0.0.0.0", "::")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; what can be expected to go wrong is one line and exit code 1."""
+    options = _parser().parse_args(arguments)
+    logging.basicConfig(level=options.log_level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    try:
+        asyncio.run(_serve(_config(options)))
+    except CellwatchError as error:
+        print(f"master-server: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+class _Server(uvicorn.Server):
+    """Tells when it can be asked."""
+
+    def __init__(self, config: uvicorn.Config, ready: dict[str, Any], ready_file: Path | None, host: str) -> None:
+        super().__init__(config)
+        self._everywhere = f" and all other addresses of {socket.gethostname()}" if host in ANY_ADDRESS else ""
+        self._ready = ready
+        self._ready_file = ready_file
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        text = json.dumps(self._ready)
+        if self._ready_file is not None:
+            partial = self._ready_file.with_suffix(".partial")
+            partial.write_text(text + "\n")
+            partial.replace(self._ready_file)
+        print(f"master-server: listening at {self._ready['url']}{self._everywhere}", flush=True)
+        for role in Role:
+            lies_in = self._ready[f"{role.value}_token_file"]
+            print(f"master-server: the token of the {role.value} lies in {lies_in}", flush=True)
+
+
+async def _serve(config: MasterConfig) -> None:
+    cell = Cell.load(config.cell)
+    access = load_access(config.state_dir, config.public_reads)
+    app = make_app(Master(cell, config.settings), access)
+    listener = _listen(config.host, config.port)
+    port = listener.getsockname()[1]
+    host = "127.0.0.1" if config.host in ANY_ADDRESS else config.host
+    ready = {
+        "url": f"http://{f'[{host}]' if ':' in host else host}:{port}",
+        "port": port,
+        "pid": os.getpid(),
+        **{f"{role.value}_token_file": str(token_file(config.state_dir, role)) for role in Role},
+    }
+    server = _Server(
+        uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=False,
+            # The caller's address is that of its connection, whatever a header says.
+            proxy_headers=False,
+            server_header=False,
+            date_header=False,
+            timeout_graceful_shutdown=STOP_S,
+        ),
+        ready,
+        config.ready_file,
+        config.host,
+    )
+    try:
+        await server.serve(sockets=[listener])
+    finally:
+        listener.close()
+        if config.ready_file is not None:
+            config.ready_file.unlink(missing_ok=True)
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family, backlog=BACKLOG, dualstack_ipv6=host == "::")
+    except OSError as error:
+        raise ConfigError(f"cannot listen at {host} port {port}: {error.strerror or error}") from error
+
+
+def _config(options: argparse.Namespace) -> MasterConfig:
+    overrides: dict[str, Any] = dict(assignments(options.set))
+    for name in ("cell", "host", "port", "state_dir", "ready_file"):
+        if (value := getattr(options, name)) is not None:
+            overrides[name] = value
+    if options.public_reads:
+        overrides["public_reads"] = True
+    return load(MasterConfig, options.config, os.environ, ENVIRONMENT_PREFIX, overrides)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="master-server",
+        description="The master that all edge units post to.",
+        epilog=f"Every option may also be a variable, as in {ENVIRONMENT_PREFIX}PORT=9000; flags win over variables, "
+        "and those over the file.",
+    )
+    parser.add_argument("--config", type=Path, metavar="YAML", help="configuration file")
+    parser.add_argument("--cell", type=Path, metavar="YAML", help="the cell that is watched (cell.yaml)")
+    parser.add_argument("--host", help="address to listen at (default: all)")
+    parser.add_argument("--port", type=int, help="port to listen at, 0 for a free one (default: 8420)")
+    parser.add_argument("--state-dir", type=Path, metavar="DIR", help="where tokens are kept")
+    parser.add_argument("--ready-file", type=Path, metavar="FILE", help="written as JSON when the master can be asked")
+    parser.add_argument("--public-reads", action="store_true", help="reading needs no token")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="any other, as in settings.voxel_size_m=0.03"
+    )
+    parser.add_argument("--log-level", default="INFO", choices=("DEBUG", "INFO", "WARNING", "ERROR"))
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The web application, assembled."""
+
+from __future__ import annotations
+
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.routing import Route
+
+from master_server.access import Access
+from master_server.master import Master
+from master_server.routes import cell, health, map, robot, units
+from master_server.routes.update import UpdateEndpoint
+from shared.configuration import sentence_of
+from shared.errors import CellwatchError, InputError, Refusal, WireError
+
+
+def make_app(master: Master, access: Access) -> FastAPI:
+    """The application that serves one master."""
+    app = FastAPI(
+        title="Cellwatch master",
+        description=(master.__doc__ or "").splitlines()[0],
+        exception_handlers={
+            Refusal: _refused,
+            InputError: _refused,
+            WireError: _refused,
+            RequestValidationError: _invalid,
+        },
+        routes=[Route("/update", UpdateEndpoint(master, access), methods=["POST"])],
+    )
+    app.state.master = master
+    app.state.access = access
+    for module in (units, cell, map, robot, health):
+        app.include_router(module.router)
+    return app
+
+
+async def _refused(request: Request, error: Exception) -> Response:
+    assert isinstance(error, CellwatchError)
+    return JSONResponse({"detail": str(error)}, error.status if isinstance(error, Refusal) else 422)
+
+
+async def _invalid(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    return JSONResponse({"detail": sentence_of(error.errors())}, 422)
+
+

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the units look through, united; what no live unit reports as seen is unseen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import WireError
+from shared.lattice import Lattice
+from shared.messages import SeenReport
+from shared.wire import unpack_seen
+
+FACTOR_TOLERANCE = 1e-6
+"""Block sizes are multiples of one another up to rounding."""
+
+
+class Coverage:
+    """One seen grid a unit, on the blocks of the cell."""
+
+    def __init__(self, blocks: Lattice) -> None:
+        """`blocks` is the cell's box in blocks, the finest that a unit may report."""
+        self.blocks = blocks
+        self._seen: dict[int, NDArray[np.bool_]] = {}
+
+    def report(self, unit_id: int, report: SeenReport) -> None:
+        """From now on the unit looks through these blocks; larger ones stand for all that they hold.
+
+        Raises:
+            WireError: the report is damaged, or its blocks are no multiple of the cell's.
+        """
+        ratio = report.block_size_m / self.blocks.voxel_size_m
+        factor = round(ratio)
+        if factor < 1 or abs(ratio - factor) > FACTOR_TOLERANCE * ratio:
+            raise WireError(
+                f"seen.block_size_m: expected a multiple of {self.blocks.voxel_size_m}, got {report.block_size_m}"
+            )
+        grid = unpack_seen(report)
+        # Cropped before it grows, so that the memory is that of the cell whatever was reported.
+        grid = grid[tuple(slice(-(-count // factor)) for count in self.blocks.shape)]
+        for axis, count in enumerate(self.blocks.shape):
+            grid = grid.repeat(min(factor, count), axis=axis)
+        seen = np.zeros(self.blocks.shape, dtype=np.bool_)
+        nx, ny, nz = (min(have, want) for have, want in zip(grid.shape, seen.shape, strict=True))
+        seen[:nx, :ny, :nz] = grid[:nx, :ny, :nz]
+        self._seen[unit_id] = seen
+
+    def withdraw(self, unit_id: int) -> None:
+        """From now on nothing is known of what the unit looks through; harmless when nothing was."""
+        self._seen.pop(unit_id, None)
+
+    def has(self, unit_id: int) -> bool:
+        """Whether the unit has reported."""
+        return unit_id in self._seen
+
+    def seen_by(self, unit_ids: Iterable[int]) -> NDArray[np.uint8]:
+        """How many of these units look through each block, in the blocks' shape, uint8."""
+        counts = np.zeros(self.blocks.shape, dtype=np.uint8)
+        for unit_id in unit_ids:
+            seen = self._seen.get(unit_id)
+            if seen is not None:
+                counts += seen
+        return counts

@@ -1,0 +1,310 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The master without a network: slots, merge, coverage, robot, settings and cell held together.
+
+Every call is handed the time; nothing here waits, reads a file or knows HTTP.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from master_server.coverage import Coverage
+from master_server.merge import NO_KEYS, MergedMap
+from master_server.registry import Registry, Slot
+from master_server.robot import RobotJoints
+from shared.cell import Cell
+from shared.configuration import sentence
+from shared.errors import Refusal
+from shared.lattice import Lattice
+from shared.messages import (
+    CONTRACT_VERSION,
+    CellReference,
+    Command,
+    InitializeAnswer,
+    InitializeRequest,
+    JointsRequest,
+    LatticeDescription,
+    Matrix,
+    RobotAnswer,
+    State,
+    UnitRow,
+    UpdateAnswer,
+    UpdateRequest,
+    Versions,
+    matrix_of,
+)
+from shared.settings import Settings
+from shared.transforms import validated
+from shared.wire import keys_from_bytes
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class MapView:
+    """The merged map at one time: keys (N,) uint32 ascending, witnesses (N,) uint8; and whether it is all there is."""
+
+    lattice: Lattice
+    lattice_version: int
+    keys: NDArray[np.uint32]
+    witnesses: NDArray[np.uint8]
+    reasons: tuple[str, ...]
+    oldest_view_age_s: float | None
+    units_live: int
+
+    @property
+    def complete(self) -> bool:
+        """Whether a voxel that is not reported, in a block that is seen, holds nothing unknown."""
+        return not self.reasons
+
+
+class Master:
+    """What the master knows, and what may be asked of it."""
+
+    def __init__(self, cell: Cell, settings: Settings) -> None:
+        """Raises InputError when the cell needs too many voxels of the size in `settings`."""
+        self.cell = cell
+        self.settings = settings
+        self.versions = Versions(settings=1, lattice=1, cell=1)
+        self.registry = Registry()
+        self.robot = RobotJoints(cell.robot.joint_names if cell.robot else None)
+        self._documents()
+        self._lattices()
+
+    # ------------------------------------------------------------------ units
+
+    def initialize(self, request: InitializeRequest, ip: str, now_ns: int) -> InitializeAnswer:
+        """A unit asks for its slot (Algorithm 8).
+
+        Raises:
+            Refusal: it speaks another contract, or there are too many units.
+        """
+        if request.contract != CONTRACT_VERSION:
+            raise Refusal(
+                400, f"contract: this master speaks version {CONTRACT_VERSION}, the unit {request.contract}"
+            )
+        slot, retired = self.registry.initialize(request, ip)
+        for gone in (slot, *retired):
+            self._withdraw(gone.id)
+        return InitializeAnswer(
+            id=slot.id,
+            session=slot.session,
+            versions=self._versions_for(slot),
+            settings=self.settings,
+            lattice=self.lattice_description,
+            cell=self.cell_reference,
+            T_world_camera=slot.T_world_camera,
+            board=self.cell_document["board"],
+            joints=self.robot.since(0),
+            received_at_ns=now_ns,
+            answered_at_ns=now_ns,
+        )
+
+    def update(self, update: UpdateRequest, ip: str, now_ns: int) -> UpdateAnswer:
+        """A unit reports its newest frame; what it reported before is replaced.
+
+        Raises:
+            Refusal: 404 for an unknown id, 403 for another's, 409 for an old session or sequence.
+            WireError: keys or seen report are malformed; nothing was changed.
+        """
+        slot = self.registry.own(update.id, ip)
+        if update.session != slot.session:
+            raise Refusal(409, f"unit {slot.id}: this session is over, initialize again")
+        if update.sequence <= slot.sequence:
+            raise Refusal(409, f"unit {slot.id}: expected a sequence above {slot.sequence}, got {update.sequence}")
+        on_lattice = update.versions.lattice == self.versions.lattice
+        keys = keys_from_bytes(update.keys, self.lattice.cell_count) if on_lattice else NO_KEYS
+        if update.seen is not None and update.versions.settings == self.versions.settings:
+            self.coverage.report(slot.id, update.seen)
+        self._take_in(slot, update, keys, now_ns)
+        if self.judge(slot, now_ns)[0] == "live":
+            self.map.replace(slot.id, keys)
+        else:
+            self.map.withdraw(slot.id)
+        return self._answer(slot, update, now_ns)
+
+    def judge(self, slot: Slot, now_ns: int) -> tuple[State, str]:
+        """A unit's state now, and why in words."""
+        return slot.judge(now_ns, self.versions, self.settings)
+
+    def units(self, now_ns: int) -> list[UnitRow]:
+        """One row a unit."""
+        return [slot.row(now_ns, *self.judge(slot, now_ns)) for slot in self.registry]
+
+    def forget(self, unit_id: int) -> None:
+        """Delete a unit. If it still runs it comes back, as a new one.
+
+        Raises:
+            Refusal: 404, there is none.
+        """
+        self.registry.remove(unit_id)
+        self._withdraw(unit_id)
+
+    def set_pose(self, unit_id: int, T_world_camera: Matrix, origin: str, ip: str | None) -> int:
+        """A camera's pose is known, by whatever means; returns its version. `ip` is the caller's, if it is a unit.
+
+        Raises:
+            Refusal: 404, there is no such unit; 403, it is another's.
+            InputError: the pose is no rigid transform.
+        """
+        slot = self.registry.get(unit_id) if ip is None else self.registry.own(unit_id, ip)
+        slot.set_pose(matrix_of(validated(T_world_camera, "T_world_camera")))
+        self._withdraw(slot.id)
+        logger.info("unit %d (%s): its pose is set (%s)", slot.id, slot.ip, origin)
+        return slot.pose_version
+
+    def ask(self, unit_id: int, verb: str) -> Command:
+        """Have a unit do something.
+
+        Raises:
+            Refusal: 404, there is none; 409, too much waits for it.
+        """
+        return self.registry.ask(self.registry.get(unit_id), verb)
+
+    # ------------------------------------------------------------------ what everyone asks
+
+    def view(self, now_ns: int) -> MapView:
+        """The union of what live units report, and what it lacks (Algorithm 9)."""
+        reasons = []
+        ages_s = []
+        for slot in self.registry:
+            state, reason = self.judge(slot, now_ns)
+            if state != "live":
+                self.map.withdraw(slot.id)
+                reasons.append(f"unit {slot.id} ({slot.ip}) is {state}: {reason}")
+                continue
+            self.map.replace(slot.id, slot.keys)
+            ages_s.append(slot.age_s(now_ns) or 0.0)
+            if not self.coverage.has(slot.id):
+                reasons.append(f"unit {slot.id} ({slot.ip}) has not reported what it looks through")
+        if not len(self.registry):
+            reasons.append("there is no unit")
+        robot_state, robot_reason = self.robot.state(now_ns, self.settings.robot_stale_after_s)
+        if robot_state not in ("fresh", "none"):
+            reasons.append(robot_reason)
+        keys, witnesses = self.map.voxels()
+        return MapView(
+            self.lattice,
+            self.versions.lattice,
+            keys,
+            witnesses,
+            tuple(reasons),
+            max(ages_s, default=None),
+            len(ages_s),
+        )
+
+    def seen_by(self, now_ns: int) -> NDArray[np.uint8]:
+        """How many live units look through each block, in the shape of `coverage.blocks`."""
+        return self.coverage.seen_by(slot.id for slot in self.registry if self.judge(slot, now_ns)[0] == "live")
+
+    # ------------------------------------------------------------------ robot
+
+    def put_joints(self, request: JointsRequest, now_ns: int) -> None:
+        """The robot tells where it is; raises as `RobotJoints.put`."""
+        self.robot.put(request, now_ns)
+
+    def robot_answer(self, since_ns: int | None, now_ns: int) -> RobotAnswer:
+        """The newest joints, or all after `since_ns`."""
+        state, reason = self.robot.state(now_ns, self.settings.robot_stale_after_s)
+        age_s = self.robot.age_s(now_ns)
+        newest = self.robot.newest
+        samples = self.robot.since(since_ns) if since_ns is not None else () if newest is None else (newest,)
+        return RobotAnswer(
+            state=state,
+            reason=reason,
+            joint_names=self.robot.joint_names or (),
+            age_s=None if age_s is None else round(age_s, 4),
+            now_ns=now_ns,
+            joints=samples,
+        )
+
+    # ------------------------------------------------------------------ what an operator changes
+
+    def change_settings(self, changes: dict[str, Any]) -> Settings:
+        """Change some settings; the others stay. Every unit has them with the answer to its next update.
+
+        Raises:
+            Refusal: 422, a name is unknown or a value out of range.
+            InputError: the cell would need too many voxels of that size.
+        """
+        try:
+            settings = Settings.model_validate({**self.settings.model_dump(), **changes})
+        except ValidationError as error:
+            raise Refusal(422, sentence(error)) from error
+        if settings == self.settings:
+            return settings
+        lattice = self.cell.lattice(settings.voxel_size_m)
+        blocks_change = settings.seen_block_size_m != self.settings.seen_block_size_m
+        lattice_changes = lattice != self.lattice
+        self.settings = settings
+        self.versions = Versions(
+            settings=self.versions.settings + 1,
+            lattice=self.versions.lattice + lattice_changes,
+            cell=self.versions.cell,
+        )
+        if lattice_changes or blocks_change:
+            self._lattices()
+        return settings
+
+    # ------------------------------------------------------------------ inside
+
+    def _documents(self) -> None:
+        self.cell_document, self.meshes = self.cell.to_document()
+        self.cell_reference = CellReference(name=self.cell.name, sha256=self.cell.version)
+
+    def _lattices(self) -> None:
+        """Begin on the lattice and blocks that settings and cell ask for; all that was reported is void."""
+        self.lattice = self.cell.lattice(self.settings.voxel_size_m)
+        self.lattice_description = LatticeDescription.of(self.lattice)
+        self.map = MergedMap(self.lattice)
+        self.coverage = Coverage(self.cell.lattice(self.settings.seen_block_size_m))
+        for slot in self.registry:
+            slot.keys = NO_KEYS
+
+    def _withdraw(self, unit_id: int) -> None:
+        self.map.withdraw(unit_id)
+        self.coverage.withdraw(unit_id)
+
+    def _take_in(self, slot: Slot, update: UpdateRequest, keys: NDArray[np.uint32], now_ns: int) -> None:
+        slot.sequence = update.sequence
+        slot.arrived_at_ns = now_ns
+        slot.versions = update.versions
+        slot.health = update.health
+        slot.keys = keys
+        if update.exchange is not None:
+            slot.clock.add(update.exchange)
+        if update.captured_at_ns != slot.captured_at_ns and update.captured_at_ns is not None:
+            slot.captures_ns.append(update.captured_at_ns)
+        slot.captured_at_ns = update.captured_at_ns
+        if update.done:
+            for command in [command for command in slot.commands if command.id in update.done]:
+                slot.commands.remove(command)
+
+    def _answer(self, slot: Slot, update: UpdateRequest, now_ns: int) -> UpdateAnswer:
+        current, theirs = self._versions_for(slot), update.versions
+        answer = UpdateAnswer(
+            versions=current,
+            received_at_ns=now_ns,
+            answered_at_ns=now_ns,
+            joints=self.robot.since(update.joints_until_ns),
+            commands=tuple(slot.commands),
+        )
+        if current == theirs:
+            return answer
+        changed: dict[str, Any] = {}
+        if current.settings != theirs.settings or current.lattice != theirs.lattice:
+            changed |= {"settings": self.settings, "lattice": self.lattice_description}
+        if current.cell != theirs.cell:
+            changed["cell"] = self.cell_reference
+        if current.pose != theirs.pose:
+            changed["T_world_camera"] = slot.T_world_camera
+        return answer.model_copy(update=changed)
+
+    def _versions_for(self, slot: Slot) -> Versions:
+        return self.versions.model_copy(update={"pose": slot.pose_version})

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The units' voxels merged into one map (Algorithm 9), at a cost of what changes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.lattice import Lattice
+
+MAX_WITNESSES = 255
+"""Witnesses are counted in uint8: there can be no more units than that."""
+
+NO_KEYS: NDArray[np.uint32] = np.empty(0, dtype=np.uint32)
+
+
+class MergedMap:
+    """Which voxels of a lattice are reported, and by how many units.
+
+    A unit's report replaces its last one in time proportional to the two. The counter is as large as the lattice,
+    but only pages of it that were ever touched take memory.
+    """
+
+    def __init__(self, lattice: Lattice) -> None:
+        self.lattice = lattice
+        self.revision = 0
+        self._witnesses = np.zeros(lattice.cell_count, dtype=np.uint8)
+        self._keys: dict[int, NDArray[np.uint32]] = {}
+        self._snapshot: tuple[NDArray[np.uint32], NDArray[np.uint8]] | None = None
+
+    def replace(self, unit_id: int, keys: NDArray[np.uint32]) -> None:
+        """From now on the unit reports `keys` (N,): ascending, each once, below the lattice's cell count."""
+        before = self._keys.get(unit_id)
+        if before is keys:
+            return
+        if before is not None:
+            self._witnesses[before] -= 1
+        self._witnesses[keys] += 1
+        self._keys[unit_id] = keys
+        self._changed()
+
+    def withdraw(self, unit_id: int) -> None:
+        """From now on the unit reports nothing; harmless when it did not."""
+        before = self._keys.pop(unit_id, None)
+        if before is not None:
+            self._witnesses[before] -= 1
+            self._changed()
+
+    def voxels(self) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
+        """The keys (M,) uint32 of all voxels reported, ascending, and their witnesses (M,) uint8."""
+        if self._snapshot is None:
+            keys = np.unique(np.concatenate(list(self._keys.values()) or [NO_KEYS]))
+            self._snapshot = keys, self._witnesses[keys]
+        return self._snapshot
+
+    def _changed(self) -> None:
+        self.revision += 1
+        self._snapshot = None

@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The units' slots (Algorithm 8), and how far each unit can be trusted now."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from master_server.merge import MAX_WITNESSES, NO_KEYS
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.errors import Refusal
+from shared.messages import MAX_COMMANDS, Command, Health, InitializeRequest, Matrix, State, UnitRow, Versions
+from shared.settings import Settings
+from shared.timebase import ClockOffset
+
+logger = logging.getLogger(__name__)
+
+MAX_UNITS = 64
+"""More cameras than any cell that we heard of has; bounds the tables, and the witnesses of a voxel."""
+
+assert MAX_UNITS <= MAX_WITNESSES
+
+FPS_FRAMES = 31
+"""Frames over which the frame rate is taken: two seconds at 15 fps."""
+
+FUTURE_TOLERANCE_NS = 5 * NS_PER_MS
+"""A capture may seem this much later than now beyond what the clock's uncertainty explains."""
+
+BLIND_VALID_SHARE = 0.05
+"""A covered lens measures nothing; the emptiest honest view of a cell still measures a fifth of its pixels."""
+
+MOVED_AGREEING_SHARE = 0.1
+"""A camera that was turned agrees with its static surfaces by chance only; a crowd before it hides less."""
+
+MOVED_STATIC_SHARE = 0.1
+"""With fewer pixels before known surfaces there is nothing to tell a moved camera by."""
+
+
+@dataclass
+class Slot:
+    """What the master knows of the one camera behind an IP. Times of the unit are by the unit's clock."""
+
+    id: int
+    ip: str
+    serial: str = ""
+    model: str = ""
+    software: str = ""
+    boot_id: str = ""
+    session: int = 0
+    sequence: int = -1
+    clock: ClockOffset = field(default_factory=ClockOffset)
+    arrived_at_ns: int | None = None
+    captured_at_ns: int | None = None
+    captures_ns: deque[int] = field(default_factory=lambda: deque(maxlen=FPS_FRAMES))
+    versions: Versions = field(default_factory=Versions)
+    keys: NDArray[np.uint32] = field(default_factory=lambda: NO_KEYS)
+    health: Health = field(default_factory=Health)
+    T_world_camera: Matrix | None = None
+    pose_version: int = 0
+    note: str = ""
+    commands: deque[Command] = field(default_factory=deque)
+
+    def set_pose(self, T_world_camera: Matrix | None, note: str = "") -> None:
+        """The camera is elsewhere from now on, or nobody knows where; `note` tells why."""
+        self.T_world_camera = T_world_camera
+        self.pose_version += 1
+        self.note = note
+        self.keys = NO_KEYS
+
+    def age_s(self, now_ns: int) -> float | None:
+        """Seconds from the last frame's capture to the master's `now_ns`; None while it cannot be told."""
+        if self.captured_at_ns is None or not self.clock.known:
+            return None
+        return (now_ns - self.captured_at_ns - self.clock.offset_ns) / NS_PER_S
+
+    def arrival_age_s(self, now_ns: int) -> float | None:
+        """Seconds since an update arrived."""
+        return None if self.arrived_at_ns is None else (now_ns - self.arrived_at_ns) / NS_PER_S
+
+    def clock_uncertainty_ns(self, now_ns: int) -> int | None:
+        """How far `age_s` may be off."""
+        return self.clock.uncertainty_ns(now_ns - self.clock.offset_ns) if self.clock.known else None
+
+    @property
+    def fps(self) -> float:
+        """Frames a second, over the last few."""
+        captures = self.captures_ns
+        if len(captures) < 2 or captures[-1] <= captures[0]:
+            return 0.0
+        return (len(captures) - 1) * NS_PER_S / (captures[-1] - captures[0])
+
+    def judge(self, now_ns: int, current: Versions, settings: Settings) -> tuple[State, str]:
+        """The unit's state, and the reason in words when it is not live.
+
+        `current` has the versions of the master; its pose counts for nothing, each slot has its own.
+        """
+        if self.T_world_camera is None:
+            return "uncalibrated", self.note or "its pose is not known yet"
+        if stale := self._stale(now_ns, current, settings):
+            trouble = f" ({self.health.trouble})" if self.health.trouble else ""
+            return "stale", stale + trouble
+        health = self.health
+        if health.trouble:
+            return "blind", health.trouble
+        if health.valid_share < BLIND_VALID_SHARE:
+            return "blind", f"only {health.valid_share:.0%} of its pixels measure anything"
+        if health.static_share >= MOVED_STATIC_SHARE and health.agreeing_share < MOVED_AGREEING_SHARE:
+            return "moved", f"only {health.agreeing_share:.0%} of the known surfaces are where they should be"
+        return "live", ""
+
+    def row(self, now_ns: int, state: State, reason: str) -> UnitRow:
+        """What `GET /units` tells."""
+        age_s, arrival_age_s = self.age_s(now_ns), self.arrival_age_s(now_ns)
+        uncertainty_ns = self.clock_uncertainty_ns(now_ns)
+        return UnitRow(
+            id=self.id,
+            ip=self.ip,
+            serial=self.serial,
+            model=self.model,
+            software=self.software,
+            state=state,
+            reason=reason,
+            age_s=None if age_s is None else round(age_s, 4),
+            arrival_age_s=None if arrival_age_s is None else round(arrival_age_s, 4),
+            clock_uncertainty_ms=None if uncertainty_ns is None else round(uncertainty_ns / NS_PER_MS, 3),
+            fps=round(self.fps, 2),
+            voxels=len(self.keys),
+            process_ms=self.health.process_ms,
+            frame_number=self.health.frame,
+            health=self.health,
+            T_world_camera=self.T_world_camera,
+            versions=self.versions,
+        )
+
+    def _stale(self, now_ns: int, current: Versions, settings: Settings) -> str:
+        """Why its last view says nothing about now; empty when it does."""
+        limit_s = settings.stale_after_s
+        arrival_age_s, age_s = self.arrival_age_s(now_ns), self.age_s(now_ns)
+        uncertainty_ns = self.clock_uncertainty_ns(now_ns)
+        if arrival_age_s is None:
+            return "no update since it registered"
+        if arrival_age_s > limit_s:
+            return f"its last update came {arrival_age_s:.1f} s ago, at most {limit_s:g} s are trusted"
+        if self.captured_at_ns is None:
+            return "no frame yet"
+        if age_s is None or uncertainty_ns is None:
+            return "its clock is not known yet"
+        if uncertainty_ns > limit_s * NS_PER_S:
+            return f"its clock is known to {uncertainty_ns / NS_PER_S:.1f} s only"
+        if age_s > limit_s:
+            return f"its last frame is {age_s:.1f} s old, at most {limit_s:g} s are trusted"
+        if age_s * NS_PER_S < -(uncertainty_ns + FUTURE_TOLERANCE_NS):
+            return f"its last frame seems to be of {-age_s:.3f} s from now: its clock jumped"
+        if self.versions.lattice != current.lattice:
+            return "it does not work on the current lattice yet"
+        if self.versions.cell != current.cell:
+            return "it does not work with the current cell yet"
+        if self.versions.pose != self.pose_version:
+            return "it does not work with its current pose yet"
+        return ""
+
+
+class Registry:
+    """All slots: one for each IP, allocated once."""
+
+    def __init__(self) -> None:
+        self._slots: dict[int, Slot] = {}
+        self._by_ip: dict[str, Slot] = {}
+        self._last_id = 0
+        self._last_command = 0
+
+    def __iter__(self) -> Iterator[Slot]:
+        return iter(self._slots.values())
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    def initialize(self, request: InitializeRequest, ip: str) -> tuple[Slot, list[Slot]]:
+        """The slot of this IP with a new session, and the slots that were retired for it.
+
+        A camera that turns up behind another IP retires its old slot; its pose moves along only within one boot of
+        the unit, for then merely the address changed. Another camera in a slot voids the pose.
+
+        Raises:
+            Refusal: 503, there are MAX_UNITS already.
+        """
+        elsewhere = [slot for slot in self if slot.serial == request.serial and slot.ip != ip]
+        slot = self._by_ip.get(ip)
+        if slot is None:
+            if len(self) - len(elsewhere) >= MAX_UNITS:
+                raise Refusal(503, f"no free slot: expected at most {MAX_UNITS} units; delete one that is gone")
+            self._last_id += 1
+            slot = Slot(self._last_id, ip)
+            self._slots[slot.id] = self._by_ip[ip] = slot
+            for old in elsewhere:
+                if old.T_world_camera is not None and old.boot_id and old.boot_id == request.boot_id:
+                    slot.set_pose(old.T_world_camera)
+        elif slot.serial != request.serial:
+            note = f"the camera changed from {slot.serial} to {request.serial}, so its pose is void"
+            logger.warning("unit %d (%s): %s", slot.id, ip, note)
+            slot.set_pose(None, note)
+        for old in elsewhere:
+            logger.warning("unit %d (%s): camera %s is at %s now", old.id, old.ip, old.serial, ip)
+            self.remove(old.id)
+        slot.serial, slot.model, slot.software = request.serial, request.model, request.software
+        slot.boot_id = request.boot_id
+        # Random, so that a session of a master before this one is never mistaken for a current one.
+        slot.session = secrets.randbits(32)
+        slot.sequence = -1
+        slot.clock = ClockOffset()
+        slot.arrived_at_ns = slot.captured_at_ns = None
+        slot.captures_ns.clear()
+        slot.keys = NO_KEYS
+        slot.health = Health()
+        return slot, elsewhere
+
+    def get(self, unit_id: int) -> Slot:
+        """The slot with this id.
+
+        Raises:
+            Refusal: 404, there is none.
+        """
+        slot = self._slots.get(unit_id)
+        if slot is None:
+            raise Refusal(404, f"unit {unit_id}: not known here, initialize first")
+        return slot
+
+    def own(self, unit_id: int, ip: str) -> Slot:
+        """The slot with this id, which must be the caller's.
+
+        Raises:
+            Refusal: 404, there is none; 403, it is that of another IP.
+        """
+        slot = self.get(unit_id)
+        if slot.ip != ip:
+            raise Refusal(403, f"unit {unit_id}: it is not the unit of {ip}")
+        return slot
+
+    def remove(self, unit_id: int) -> None:
+        """Forget a unit.
+
+        Raises:
+            Refusal: 404, there is none.
+        """
+        slot = self.get(unit_id)
+        del self._slots[unit_id], self._by_ip[slot.ip]
+
+    def ask(self, slot: Slot, verb: str) -> Command:
+        """Have a unit do something; it learns of it with the answer to its next update.
+
+        Raises:
+            Refusal: 409, too many commands wait for it already.
+        """
+        if len(slot.commands) >= MAX_COMMANDS:
+            raise Refusal(409, f"unit {slot.id}: {MAX_COMMANDS} commands wait for it already")
+        self._last_command += 1
+        command = Command.model_validate({"id": self._last_command, "verb": verb})
+        slot.commands.append(command)
+        return command

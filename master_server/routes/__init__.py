@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The master as HTTP: each module translates one part of it, and decides nothing.
+
+In the order of the flow:
+
+    common    bodies in bounds, JSON or msgpack, tokens
+    update    `POST /update`, the path that every frame of every unit takes
+    units     registering, and what is known of each unit
+    cell      the cell's document and meshes
+    map       the merged map and the settings
+    robot     the robot's joints
+    health    whether the master lives
+"""

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all routes share: bodies in bounds, JSON or msgpack, tokens."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable, Coroutine
+from typing import Annotated, Any
+
+import msgpack
+from fastapi import Depends, Request, Response
+from fastapi.routing import APIRoute
+from fastapi.security import HTTPBearer
+from starlette.requests import ClientDisconnect
+from starlette.types import Message, Scope
+
+from master_server.access import OPERATORS, UNITS, Access, Role
+from master_server.master import Master
+from shared.errors import Refusal, WireError
+from shared.wire import MEDIA_TYPE, unpack
+
+MAX_BODY_BYTES = 2**18
+"""Of any request but updates, cells and meshes: settings, a pose, joints."""
+
+BODY_TIMEOUT_S = 5.0
+"""A unit sends a body in one go; who takes longer holds a connection for nothing."""
+
+PREFIX = "::ffff:"
+"""IPv4 addresses look like this on a socket for both."""
+
+
+async def body_of(request: Request, max_bytes: int) -> bytes:
+    """The whole body.
+
+    Raises:
+        Refusal: 413, more than `max_bytes`; 408, it came too slowly; 400, the sender went away.
+    """
+    declared = request.headers.get("content-length", "0")
+    if declared.isdigit() and int(declared) > max_bytes:
+        raise Refusal(413, f"body: expected at most {max_bytes} bytes, got {declared}")
+    try:
+        return await asyncio.wait_for(_read(request, max_bytes), BODY_TIMEOUT_S)
+    except asyncio.TimeoutError as error:
+        raise Refusal(408, f"body: expected all of it within {BODY_TIMEOUT_S:g} s") from error
+    except ClientDisconnect as error:
+        raise Refusal(400, "body: the sender went away") from error
+
+
+def ip_of(scope: Scope) -> str:
+    """The address at the other end of the connection; no header can claim another."""
+    client = scope.get("client")
+    if client is None:
+        raise Refusal(400, "the connection has no address")
+    return str(client[0]).removeprefix(PREFIX)
+
+
+class Negotiated(APIRoute):
+    """JSON by default, msgpack where `Content-Type` or `Accept` says so; every body within bounds."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        handler = super().get_route_handler()
+
+        async def negotiated(request: Request) -> Response:
+            response = await handler(await _as_json(request))
+            if response.media_type == "application/json" and wants_msgpack(request):
+                packed = msgpack.packb(json.loads(bytes(response.body)))
+                return Response(packed, response.status_code, media_type=MEDIA_TYPE)
+            return response
+
+        return negotiated
+
+
+def wants_msgpack(request: Request) -> bool:
+    """Whether the caller asked for msgpack."""
+    return MEDIA_TYPE in request.headers.get("accept", "")
+
+
+def master_of(request: Request) -> Master:
+    """The one master of this application."""
+    master = request.app.state.master
+    assert isinstance(master, Master)
+    return master
+
+
+def access_of(request: Request) -> Access:
+    """The tokens of this application."""
+    access = request.app.state.access
+    assert isinstance(access, Access)
+    return access
+
+
+def authorization_of(request: Request) -> bytes | None:
+    """The `Authorization` header as it came."""
+    return next((value for name, value in request.scope["headers"] if name == b"authorization"), None)
+
+
+def may_read(request: Request) -> None:
+    """Dependency: any token, or none where reads are public."""
+    access_of(request).check_read(authorization_of(request))
+
+
+def is_operator(request: Request) -> None:
+    """Dependency: the operator's token."""
+    access_of(request).check(authorization_of(request), OPERATORS)
+
+
+def is_unit(request: Request) -> None:
+    """Dependency: the units' token."""
+    access_of(request).check(authorization_of(request), UNITS)
+
+
+def is_known(request: Request) -> Role:
+    """Dependency: either token; tells whose it is."""
+    return access_of(request).check(authorization_of(request), UNITS | OPERATORS)
+
+
+# Only so that the documentation of the API tells of it; the checks are above.
+bearer = Depends(HTTPBearer(auto_error=False, description="The token of the units or of the operator."))
+
+MasterDependency = Annotated[Master, Depends(master_of)]
+READERS = [bearer, Depends(may_read)]
+OPERATOR_ONLY = [bearer, Depends(is_operator)]
+UNIT_ONLY = [bearer, Depends(is_unit)]
+
+
+async def _read(request: Request, max_bytes: int) -> bytes:
+    chunks = bytearray()
+    async for chunk in request.stream():
+        chunks += chunk
+        if len(chunks) > max_bytes:
+            raise Refusal(413, f"body: expected at most {max_bytes} bytes, got more")
+    return bytes(chunks)
+
+
+async def _as_json(request: Request) -> Request:
+    """The same request with its body read within bounds, and as JSON if it was msgpack."""
+    if request.method in ("GET", "DELETE", "HEAD"):
+        return request
+    body = await body_of(request, MAX_BODY_BYTES)
+    headers = request.scope["headers"]
+    if request.headers.get("content-type", "").split(";")[0].strip() == MEDIA_TYPE:
+        try:
+            body = json.dumps(unpack(body, MAX_BODY_BYTES)).encode()
+        except (TypeError, ValueError) as error:
+            raise WireError(f"body: expected msgpack of what JSON can hold: {error}") from error
+        headers = [(name, value) for name, value in headers if name not in (b"content-type", b"content-length")]
+        headers += [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
+
+    async def receive() -> Message:
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    return Request({**request.scope, "headers": headers}, receive)

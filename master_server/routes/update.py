@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`POST /update`: bytes in, arrays merged, bytes out, with no framework on the way.
+
+Fifty units at 30 frames a second take it 1,500 times a second.
+"""
+
+from __future__ import annotations
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.types import Receive, Scope, Send
+
+from master_server.access import UNITS, Access
+from master_server.master import Master
+from master_server.routes.common import authorization_of, body_of, ip_of
+from shared.clock import monotonic_ns
+from shared.errors import Refusal, WireError
+from shared.wire import MAX_UPDATE_BYTES, MEDIA_TYPE, decode_update, encode_update_answer
+
+
+class UpdateEndpoint:
+    """An ASGI application for the one path."""
+
+    def __init__(self, master: Master, access: Access) -> None:
+        self._master = master
+        self._access = access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        request = Request(scope, receive)
+        try:
+            response = await self._answer(request)
+        except Refusal as refusal:
+            response = JSONResponse({"detail": str(refusal)}, refusal.status)
+        except WireError as error:
+            response = JSONResponse({"detail": str(error)}, 422)
+        await response(scope, receive, send)
+
+    async def _answer(self, request: Request) -> Response:
+        self._access.check(authorization_of(request), UNITS)
+        body = await body_of(request, MAX_UPDATE_BYTES)
+        received_at_ns = monotonic_ns()
+        answer = self._master.update(decode_update(body), ip_of(request.scope), received_at_ns)
+        answer = answer.model_copy(update={"answered_at_ns": monotonic_ns()})
+        return Response(encode_update_answer(answer), media_type=MEDIA_TYPE)

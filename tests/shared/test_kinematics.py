@@ -46,9 +46,11 @@ MIXED = """<robot name="mixed">
   <link name="finger_right"><collision><geometry><sphere radius="0.02"/></geometry></collision></link>
   <joint name="finger_right_joint" type="prismatic"><parent link="arm"/><child link="finger_right"/>
     <origin xyz="0.4 -0.02 0" rpy="0 0 3.1"/><axis xyz="0 2 0"/>
-    <mimic joint="finger_joint" multiplier="-0.5" offset="0.01"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint>
+    <mimic joint="finger_joint" multiplier="-0.5" offset="0.01"/>
+    <limit lower="0" upper="1" effort="1" velocity="1"/></joint>
   <joint name="slide" type="prismatic"><parent link="rail"/><child link="carriage"/>
-    <origin xyz="0 0 0.1" rpy="0.1 0 0"/><axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+    <origin xyz="0 0 0.1" rpy="0.1 0 0"/><axis xyz="1 0 0"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
   <joint name="mount" type="fixed"><parent link="carriage"/><child link="post"/>
     <origin xyz="0 0 0.05" rpy="0 0 0.3"/></joint>
   <joint name="turn" type="continuous"><parent link="post"/><child link="arm"/><origin xyz="0 0 0.5"/>

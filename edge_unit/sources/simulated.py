@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A depth camera in the simulated cell.
+
+The world is a pure function of the seconds since `epoch_ns`, so units that are told the same epoch and seed see
+the same people at the same time. Only this source imports the simulation, and only when it is opened.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, Literal
+
+import msgpack
+from pydantic import BaseModel, ConfigDict, Field
+
+from edge_unit.sources.frame import CameraInfo, DepthFrame
+from shared.cell import Cell
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.errors import CellwatchError, SourceError
+
+if TYPE_CHECKING:
+    from simulation.camera import SimulatedCamera, SimulatedFrame
+    from simulation.truth import TruthFinder
+
+
+class SimulatedSourceConfig(BaseModel):
+    """Which camera of which simulated cell."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    kind: Literal["simulated"] = "simulated"
+    camera: int = Field(default=0, ge=0, lt=50, description="Which camera of the rig.")
+    cameras: int = Field(default=4, ge=1, le=50, description="How many cameras the rig has.")
+    width: int = Field(default=424, description="Columns: 424, 640, 848 or 1280.")
+    height: int = Field(default=240, description="Rows: 240, 480, 480 or 720.")
+    fps: float = Field(default=15.0, gt=0.0, le=90.0, description="Frames a second.")
+    epoch_ns: int = Field(
+        default=0, ge=0, description="CLOCK_MONOTONIC in ns at which the world's time is 0; the same for all units."
+    )
+    people: int = Field(default=1, ge=0, le=2, description="How many people walk beside the table.")
+    seed: int = Field(default=0, ge=0, le=0xFFFF, description="Decides who walks how, and all noise.")
+    cell: Path | None = Field(default=None, description="A cell.yaml with a UR3e; the demo cell when left out.")
+    truth_path: Path | None = Field(
+        default=None, description="File to which the truth of every frame is appended, for evaluation."
+    )
+    truth_voxel_size_m: float = Field(default=0.05, ge=0.01, le=0.10, description="Voxel size of that truth.")
+
+    @property
+    def serial(self) -> str:
+        """The camera's serial number."""
+        return f"SIM{self.seed:05d}{self.camera:02d}"
+
+
+class SimulatedSource:
+    """Renders a frame whenever one is due; a `DepthSource`.
+
+    With `truth_path`, one msgpack map a frame is appended there: `captured_at_ns`, `frame_number`, `voxel_size_m`,
+    `visible_keys` and `visible_counts`, `surface_keys` (little-endian uint32 as bytes; see `simulation.truth`).
+    """
+
+    def __init__(self, config: SimulatedSourceConfig) -> None:
+        self._config = config
+        self._period_ns = round(NS_PER_S / config.fps)
+        self._camera: SimulatedCamera | None = None
+        self._truth: TruthFinder | None = None
+        self._truth_file: BinaryIO | None = None
+        self._worker: ThreadPoolExecutor | None = None
+        self._closing = asyncio.Event()
+
+    async def open(self) -> CameraInfo:
+        """See `DepthSource`."""
+        self._closing.clear()
+        # One thread: frames and the writing of their truth never overlap.
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="simulated-camera")
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self._worker, self._start)
+        except BaseException:
+            await self.close()
+            raise
+
+    async def frames(self) -> AsyncIterator[DepthFrame]:
+        """See `DepthSource`. A frame is captured at the moment at which it is due, and rendered right after."""
+        worker = self._worker
+        if worker is None:
+            raise SourceError("simulated camera: expected to be opened before its frames are read")
+        loop = asyncio.get_running_loop()
+        writing: asyncio.Future[None] | None = None
+        number = -1
+        while not self._closing.is_set():
+            number = self._next_number(number, monotonic_ns())
+            due_ns = self._config.epoch_ns + number * self._period_ns
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._closing.wait(), (due_ns - monotonic_ns()) / NS_PER_S)
+            if self._closing.is_set():
+                return
+            frame = await loop.run_in_executor(worker, self._capture, due_ns)
+            if writing is not None:
+                await writing
+            if self._truth_file is not None:
+                writing = loop.run_in_executor(worker, self._write_truth, due_ns, number, frame)
+            yield DepthFrame(frame.depth, due_ns, number)
+
+    async def close(self) -> None:
+        """See `DepthSource`."""
+        self._closing.set()
+        worker, self._worker = self._worker, None
+        if worker is not None:
+            await asyncio.get_running_loop().run_in_executor(worker, self._stop)
+            worker.shutdown(wait=False)
+
+    def _next_number(self, last: int, now_ns: int) -> int:
+        """The frame after `last`, or a later one when a slow reader has let more become due."""
+        latest_due = (now_ns - self._config.epoch_ns) // self._period_ns
+        return max(last + 1, latest_due if last >= 0 else latest_due + 1, 0)
+
+    def _start(self) -> CameraInfo:
+        """Build the world; imports the simulation, which a unit without it does not have."""
+        config = self._config
+        try:
+            from simulation.camera import SimulatedCamera, d435i_intrinsics, rig
+            from simulation.truth import TruthFinder
+            from simulation.world import World
+        except ImportError as error:
+            raise SourceError(
+                f"simulated camera: expected the simulation to be installed (pip install 'cellwatch[sim]'): {error}"
+            ) from error
+        if config.camera >= config.cameras:
+            raise SourceError(f"simulated camera: expected a camera below {config.cameras}, got {config.camera}")
+        try:
+            intrinsics = d435i_intrinsics(config.width, config.height)
+            world = World.demo(config.people, config.seed, Cell.load(config.cell) if config.cell else None)
+            pose = rig(world.cell, config.cameras)[config.camera]
+            lattice = world.cell.lattice(config.truth_voxel_size_m)
+        except CellwatchError as error:
+            raise SourceError(f"simulated camera: {error}") from error
+        camera = SimulatedCamera(world, pose, intrinsics, seed=config.seed * 64 + config.camera)
+        # The first frame compiles what is not in the cache yet.
+        first = camera.capture(0.0)
+        if config.truth_path is not None:
+            self._truth = TruthFinder(intrinsics, pose, lattice, camera.noise)
+            self._truth.find(first.view)
+            try:
+                self._truth_file = config.truth_path.open("ab")
+            except OSError as error:
+                raise SourceError(f"simulated camera: truth_path: {error}") from error
+        self._camera = camera
+        return CameraInfo(config.serial, "Simulated D435i", intrinsics, pose)
+
+    def _stop(self) -> None:
+        if self._truth_file is not None:
+            self._truth_file.close()
+        self._camera, self._truth, self._truth_file = None, None, None
+
+    def _capture(self, due_ns: int) -> SimulatedFrame:
+        assert self._camera is not None
+        return self._camera.capture((due_ns - self._config.epoch_ns) / NS_PER_S)
+
+    def _write_truth(self, captured_at_ns: int, frame_number: int, frame: SimulatedFrame) -> None:
+        assert self._truth is not None
+        assert self._truth_file is not None
+        truth = self._truth.find(frame.view)
+        record = {
+            "captured_at_ns": captured_at_ns,
+            "frame_number": frame_number,
+            "voxel_size_m": self._config.truth_voxel_size_m,
+            "visible_keys": truth.visible_keys.astype("<u4").tobytes(),
+            "visible_counts": truth.visible_counts.astype("<u4").tobytes(),
+            "surface_keys": truth.surface_keys.astype("<u4").tobytes(),
+        }
+        self._truth_file.write(msgpack.packb(record))
+        self._truth_file.flush()

@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Everything that pretends to be hardware: a cell, a moving robot, people, depth cameras with their faults.
+
+All of it is a pure function of a time in seconds and a seed: processes agree about the world without talking,
+and tests need no clock. In the order of the flow:
+
+    scene        what stands where at one moment, and whose it is
+    robot_path   how the robot moves
+    people       people who walk and reach, as capsules
+    world        a cell with its robot, people and unknown things
+    raster       true depth, fast: our own z-buffer, capsules by formula
+    raycast      true depth, independent: rays cast by Embree
+    depth_noise  the faults of a stereo depth camera
+    truth        which voxels should be reported, and which must not
+    camera       a depth camera in the world, and where a cell's cameras hang
+"""

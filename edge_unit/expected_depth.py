@@ -188,7 +188,6 @@ class RobotLayer:
         return bool((moved + np.abs(padding_m - drawn_padding) <= STILL_M).all())
 
     def _clear(self) -> None:
-        self._buffer.clear(self._batch.rectangles)
         limits.clear_band(self._batch.rectangles, self.near_raw, self.span_raw)
         self.rows[:] = (0, -1, 0, -1)
 

@@ -78,6 +78,7 @@ class DepthPipeline:
         stride = -(-intrinsics.width // MASK_ALIGNMENT) * MASK_ALIGNMENT
         self._mask = np.zeros((intrinsics.height, stride), np.uint8)
         self._limit_raw = np.empty(intrinsics.shape, np.uint16)
+        self._room_raw = np.empty(intrinsics.shape, np.uint16)
         self._scratch_raw = np.empty((2, *intrinsics.shape), np.uint16)
         self._unlearned = np.full(intrinsics.shape, np.nan, np.float32)
         self._depth_raw = np.zeros(intrinsics.shape, np.uint16)
@@ -275,11 +276,11 @@ class DepthPipeline:
         self._depth_raw = depth_raw
         foreground.foreground_mask(
             depth_raw,
-            self._limit_raw,
+            self._room_raw,
             self._robot.near_raw,
             self._robot.span_raw,
             self._robot.rows,
-            max(int(np.ceil(self.settings.range_min_m / self.intrinsics.depth_scale_m)), 1),
+            self._minimum_raw,
             self._mask,
         )
 
@@ -308,6 +309,8 @@ class DepthPipeline:
         )
         radius_px = round(settings.edge_radius_px * camera.width / EDGE_RADIUS_WIDTH_PX)
         limits.nearest_over(raw, radius_px, scratch, self._limit_raw)
+        self._minimum_raw = max(int(np.ceil(settings.range_min_m / camera.depth_scale_m)), 1)
+        np.subtract(np.maximum(self._limit_raw, self._minimum_raw), self._minimum_raw, out=self._room_raw)
         w = self._cad.nearest_w
         cad_m = np.full(camera.shape, np.inf, np.float32)
         np.divide(1.0, w, out=cad_m, where=w > 0.0)

@@ -12,9 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.kernels.jit import kernel
+from edge_unit.kernels.rasterize import NOTHING_FARTHEST
 
 RAW_MAX = 65535
 """The largest raw depth."""
+
+ZERO, ONE, TOP = np.float32(0.0), np.float32(1.0), np.float32(RAW_MAX)
+"""In float32, for one float64 among them would halve what the vector unit does at once."""
 
 
 @kernel
@@ -71,6 +75,31 @@ def nearest_over(
 
 
 @kernel
+def band_of_row(
+    nearest_w: NDArray[np.float32],
+    farthest_w: NDArray[np.float32],
+    noise_per_m: np.float32,
+    depth_m: np.float32,
+    units_per_m: np.float32,
+    near_raw: NDArray[np.uint16],
+    span_raw: NDArray[np.uint16],
+) -> None:
+    """One stretch of a row of `robot_band_raw`; written for the vectoriser: no branch, one type, nothing but arrays."""
+    for i in range(len(nearest_w)):
+        w = nearest_w[i]
+        z_near = ONE / w
+        z_far = ONE / farthest_w[i]
+        near = min(max((z_near - noise_per_m * z_near * z_near) * units_per_m, ZERO), TOP)
+        far = min(max((z_far + noise_per_m * z_far * z_far + depth_m) * units_per_m, ZERO), TOP)
+        low = np.int32(near)
+        # Where nothing was drawn w is 0 and the above is nonsense: what stood there before stays.
+        near_raw[i] = np.uint16(low) if w > ZERO else near_raw[i]
+        span_raw[i] = np.uint16(np.int32(far) - low) if w > ZERO else span_raw[i]
+        nearest_w[i] = ZERO
+        farthest_w[i] = NOTHING_FARTHEST
+
+
+@kernel
 def robot_band_raw(
     nearest_w: NDArray[np.float32],
     farthest_w: NDArray[np.float32],
@@ -85,34 +114,32 @@ def robot_band_raw(
 
     From the nearest padded surface less its noise margin to the farthest padded surface plus its margin plus
     `depth_m`: what stands behind the robot's silhouette is still seen. The band is stored as its lower end
-    and its length, so that the filter needs one unsigned compare; where there is no robot the band is empty
-    (lower end 65535). `nearest_w`, `farthest_w` (H, W) of 1/m; out (H, W).
+    and its length, so that the filter needs one unsigned compare. Where there is no robot, `near_raw` and `span_raw`
+    (H, W) keep the empty band that `clear_band` wrote. The drawing, `nearest_w` and `farthest_w` (H, W) of 1/m, is
+    taken in and cleared in the same pass: it is hot in the cache only once.
     """
-    one, zero, top = np.float32(1.0), np.float32(0.0), np.float32(RAW_MAX)
-    units = np.float32(1.0 / depth_scale_m)
     noise = np.float32(noise_per_m)
-    behind = np.float32(depth_m)
+    depth = np.float32(depth_m)
+    units = np.float32(1.0 / depth_scale_m)
     for m in range(len(rectangles)):
-        first, last = rectangles[m, 2], rectangles[m, 3] + 1
+        first, end = rectangles[m, 2], rectangles[m, 3] + 1
         for y in range(rectangles[m, 0], rectangles[m, 1] + 1):
-            for x in range(first, last):
-                w_near = nearest_w[y, x]
-                z_near = one / w_near
-                z_far = one / farthest_w[y, x]
-                near = min(max((z_near - noise * z_near * z_near) * units, zero), top)
-                far = min(max((z_far + noise * z_far * z_far + behind) * units, zero), top)
-                # Nothing drawn: w is 0, z infinite, and near is NaN; the compare below sends it to the top.
-                low = np.int32(near) if w_near > zero else np.int32(RAW_MAX)
-                high = np.int32(far) if w_near > zero else np.int32(RAW_MAX)
-                near_raw[y, x] = np.uint16(low)
-                span_raw[y, x] = np.uint16(high - low if high > low else 0)
+            band_of_row(
+                nearest_w[y, first:end],
+                farthest_w[y, first:end],
+                noise,
+                depth,
+                units,
+                near_raw[y, first:end],
+                span_raw[y, first:end],
+            )
 
 
 @kernel
 def clear_band(rectangles: NDArray[np.int32], near_raw: NDArray[np.uint16], span_raw: NDArray[np.uint16]) -> None:
-    """Make the robot's band empty inside the `rectangles` (M, 4)."""
+    """Make the robot's band empty inside the `rectangles` (M, 4): its lower end is where no limit reaches."""
     for m in range(len(rectangles)):
+        first, end = rectangles[m, 2], rectangles[m, 3] + 1
         for y in range(rectangles[m, 0], rectangles[m, 1] + 1):
-            for x in range(rectangles[m, 2], rectangles[m, 3] + 1):
-                near_raw[y, x] = np.uint16(RAW_MAX)
-                span_raw[y, x] = np.uint16(0)
+            near_raw[y, first:end] = np.uint16(RAW_MAX)
+            span_raw[y, first:end] = np.uint16(0)

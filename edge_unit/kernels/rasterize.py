@@ -65,7 +65,6 @@ def fill_triangle(
     long_slope = (u2 - u0) / (v2 - v0)
     upper_slope = (u1 - u0) / (v1 - v0) if v1 > v0 else 0.0
     lower_slope = (u2 - u1) / (v2 - v1) if v2 > v1 else 0.0
-    step = np.float32(w_per_u)
     for y in range(top, bottom + 1):
         u_long = u0 + (y - v0) * long_slope
         u_short = u0 + (y - v0) * upper_slope if y < v1 else u1 + (y - v1) * lower_slope
@@ -73,15 +72,20 @@ def fill_triangle(
         last = min(math.floor(max(u_long, u_short)), right)
         if first > last:
             continue
-        w_first = np.float32(w0 + (first - u0) * w_per_u + (y - v0) * w_per_v)
+        # A sliver's gradient is ill-conditioned: never leave the range of its corners.
+        w_row = w0 + (y - v0) * w_per_v
+        w = min(max(np.float32(w_row + (first - u0) * w_per_u), w_low), w_high)
+        w_last = min(max(np.float32(w_row + (last - u0) * w_per_u), w_low), w_high)
+        step = (w_last - w) / np.float32(max(last - first, 1))
         nearest_row = nearest_w[y]
         farthest_row = farthest_w[y]
-        for i in range(last - first + 1):
-            # A sliver's gradient is ill-conditioned: never leave the range of its corners.
-            w = min(max(w_first + np.float32(i) * step, w_low), w_high)
-            x = first + i
-            nearest_row[x] = max(nearest_row[x], w)
-            farthest_row[x] = min(farthest_row[x], w)
+        # Unsigned, for a signed index is tested for counting from the end.
+        for x in range(np.uint64(first), np.uint64(last + 1)):
+            nearest = nearest_row[x]
+            farthest = farthest_row[x]
+            nearest_row[x] = w if w > nearest else nearest
+            farthest_row[x] = w if w < farthest else farthest
+            w += step
     rectangle[0] = min(rectangle[0], top)
     rectangle[1] = max(rectangle[1], bottom)
     rectangle[2] = min(rectangle[2], left)

@@ -18,6 +18,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from shared.errors import CellError
+from shared.kinematics import MAX_JOINTS
 from shared.meshes import MAX_COORDINATE_M
 from shared.transforms import Transform, from_xyz_rpy
 
@@ -114,7 +115,7 @@ class DHFile(_Model):
     """A serial robot by its rows."""
 
     base: ShapeFile | None = None
-    joints: tuple[DHJointFile, ...] = Field(min_length=1, max_length=64)
+    joints: tuple[DHJointFile, ...] = Field(min_length=1, max_length=MAX_JOINTS)
 
 
 class RobotFile(_Model):
@@ -201,8 +202,11 @@ def read_cell_file(path: str | Path) -> CellFile:
         raise CellError(f"{file}: expected a readable cell file, got: {error.strerror}") from error
     try:
         content = yaml.load(text, Loader=_StrictLoader)
+    except yaml.MarkedYAMLError as error:
+        line = f"line {error.problem_mark.line + 1}: " if error.problem_mark is not None else ""
+        raise CellError(f"{file}: {line}expected YAML, got a fault: {error.problem}") from error
     except yaml.YAMLError as error:
-        raise CellError(f"{file}: expected YAML, got: {' '.join(str(error).split())}") from error
+        raise CellError(f"{file}: expected YAML, got a fault: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
         raise CellError(f"{file}: expected keys and values, got {type(content).__name__}")
     try:
@@ -281,9 +285,29 @@ def _sentence(problem: Mapping[str, Any]) -> str:
         return f"{key}: expected a value, got none"
     if problem["type"] == "value_error":
         return f"{key + ': ' if key else ''}{problem['ctx']['error']}"
-    shown = repr(value) if isinstance(value, (str, int, float, bool)) or value is None else type(value).__name__
-    expected = str(problem["msg"]).removeprefix("Input should be ").removeprefix("a ").removeprefix("valid ")
-    return f"{key}: expected {expected}, got {shown}"
+    shown = repr(value) if isinstance(value, (str, int, float, bool)) else _KINDS.get(type(value), "something else")
+    if problem["type"] in ("too_short", "too_long"):
+        bound = "at least" if problem["type"] == "too_short" else "at most"
+        count = problem["ctx"].get("min_length", problem["ctx"].get("max_length"))
+        return f"{key}: expected {bound} {count} entries, got {problem['ctx']['actual_length']}"
+    if problem["type"] in _EXPECTED:
+        return f"{key}: expected {_EXPECTED[problem['type']].format(**problem.get('ctx', {}))}, got {shown}"
+    return f"{key}: expected {str(problem['msg']).removeprefix('Input should be ')}, got {shown}"
+
+
+_EXPECTED = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "string_type": "text",
+    "finite_number": "a finite number",
+    "tuple_type": "a list",
+    "dict_type": "keys and values",
+    "model_type": "keys and values",
+    "string_pattern_mismatch": "text that matches {pattern}",
+}
+"""What pydantic's kinds of errors expect, in the words of someone who writes YAML."""
+
+_KINDS = {dict: "keys and values", list: "a list", type(None): "nothing"}
 
 
 def _keys_at(location: tuple[int | str, ...]) -> list[str]:

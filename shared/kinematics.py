@@ -23,8 +23,8 @@ from shared.meshes import TriangleMesh, mesh_by_hash
 from shared.transforms import Transform, from_rotation_translation, identity, rotation_about, validated
 from shared.urdf import MeshKind, UrdfJoint, UrdfModel, read_urdf
 
-MAX_JOINTS = 64
-"""Two arms with hands; a table longer than this is a mistake, and forward kinematics runs every frame."""
+MAX_JOINTS = 128
+"""Two arms with hands have a hundred, mimic joints counted; a longer table is a mistake."""
 
 MAX_FRAMES = 512
 """Links of the largest humanoid descriptions, several times over."""
@@ -297,7 +297,10 @@ class Robot:
             if parent not in frames:
                 raise KinematicsError(f"{path}: expected a link to hold the tool, got {parent}")
             attachments.append(Attachment("tool", *frames[parent], tool))
-        return cls(model.name, names, motions, attachments, T_world_base)
+        try:
+            return cls(model.name, names, motions, attachments, T_world_base)
+        except KinematicsError as error:
+            raise KinematicsError(f"{path}: {error}") from error
 
     def to_document(self) -> tuple[dict[str, Any], dict[str, bytes]]:
         """The robot as a plain document, and its meshes' canonical bytes by sha256."""

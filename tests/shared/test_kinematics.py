@@ -163,7 +163,7 @@ def test_dh_and_urdf_of_example_robot_data_agree() -> None:
         T_base_tool = inverse(urdf.frame_pose("base", positions)) @ urdf.frame_pose("tool0", positions)
         np.testing.assert_allclose(T_base_tool, dh.frame_pose("link_6", positions), atol=2e-4)
     assert [link.name for link in urdf.links if not link.moving] == ["base_link"]
-    assert len(urdf.links) == 7
+    assert [link.name for link in urdf.links][-2:] == ["wrist_3_link", "ee_link"]
 
 
 @given(dh_rows(), st.randoms(use_true_random=False))
@@ -365,7 +365,7 @@ def test_bad_documents_are_refused() -> None:
         (changed(motions=[{**motion, "parent": -1, "axis": [0, 0, 2]}]), "expected a unit axis in joint 0"),
         (changed(motions=[{**motion, "offset": math.nan}]), "offset"),
         (changed(motions=[{**motion, "kind": "planar"}]), "kind"),
-        (changed(motions=[motion] * 65), "motions"),
+        (changed(motions=[motion] * 129), "motions"),
         (changed(frames=[{**frame, "body": 6}]), "expected link link_1 on a body below 6, got 6"),
         (changed(frames=[frame, frame]), "expected each link once, got link_1 more than once"),
         (changed(frames=[{**frame, "T_body_frame": [[1, 2], [3]]}]), "T_body_frame: expected a 4x4 matrix"),
@@ -392,8 +392,40 @@ def test_contradictory_tables_and_rows_are_refused() -> None:
         Robot.from_dh([DHJoint("a"), DHJoint("b")], [None, None], name="ur")
     with pytest.raises(KinematicsError, match="expected finite numbers in joint 0"):
         Robot.from_dh([DHJoint("a", theta_rad=math.nan)], [None, None])
-    with pytest.raises(KinematicsError, match="expected at most 64 moving joints, got 65"):
-        Robot.from_dh([DHJoint(f"j{index}") for index in range(65)], [None] * 66)
+    with pytest.raises(KinematicsError, match="expected at most 128 moving joints, got 129"):
+        Robot.from_dh([DHJoint(f"j{index}") for index in range(129)], [None] * 130)
+
+
+def test_contradiction_found_after_reading_names_the_file(tmp_path: Path) -> None:
+    links = "".join(f'<link name="l{index}"/>' for index in range(130))
+    joints = "".join(
+        f'<joint name="j{index}" type="continuous"><parent link="l{index}"/><child link="l{index + 1}"/></joint>'
+        for index in range(129)
+    )
+    file = urdf_file(tmp_path, f'<robot name="snake">{links}{joints}</robot>')
+    with pytest.raises(KinematicsError) as caught:
+        Robot.from_urdf(file)
+    assert str(caught.value) == f"{file}: snake: expected at most 128 moving joints, got 129"
+
+
+def test_unknown_and_forgotten_joints_are_named(tmp_path: Path) -> None:
+    file = urdf_file(tmp_path, MIXED)
+    free = "slide, turn, finger_joint"
+    with pytest.raises(KinematicsError, match=f"expected actuated joints out of {free}, got finger_right_joint"):
+        Robot.from_urdf(file, joints=["slide", "turn", "finger_joint", "finger_right_joint"])
+    with pytest.raises(KinematicsError, match=f"expected actuated joints out of {free}, got mount"):
+        Robot.from_urdf(file, held_joints={"mount": 0.0})
+    with pytest.raises(KinematicsError, match="to be listed or held, got neither for turn, finger_joint"):
+        Robot.from_urdf(file, joints=["slide"])
+    with pytest.raises(KinematicsError, match="expected joints either listed or held, got turn in both"):
+        Robot.from_urdf(file, joints=["slide", "turn"], held_joints={"turn": 0.0, "finger_joint": 0.0})
+    with pytest.raises(KinematicsError, match="expected each joint once, got turn more than once"):
+        Robot.from_urdf(file, joints=["slide", "turn", "turn", "finger_joint"])
+    file.write_text(MIXED.replace('mimic joint="finger_joint"', 'mimic joint="finger_right_joint"'))
+    with pytest.raises(
+        KinematicsError, match="expected joint finger_right_joint to mimic another joint, got finger_right"
+    ):
+        Robot.from_urdf(file)
 
 
 def test_robot_without_joints_stands() -> None:

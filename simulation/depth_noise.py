@@ -32,8 +32,11 @@ GAUSS_BITS = 16
 SIGMA_STEP_M, SIGMA_END_M = 0.005, 20.0
 """The table of standard deviations over depth; beyond its end the last value holds."""
 
-PERSISTENT_SHARE = 0.6
+PERSISTENT_SHARE = 0.8
 """Of the variance of where holes and ragged borders lie: a surface without texture keeps its hole, which flickers."""
+
+
+_LOW_64 = 0xFFFF_FFFF_FFFF_FFFF
 
 
 class DepthNoise(BaseModel):
@@ -115,7 +118,7 @@ class DepthSensor:
     def __init__(self, intrinsics: Intrinsics, noise: DepthNoise, seed: int) -> None:
         self._intrinsics = intrinsics
         self._noise = noise
-        self._seed = np.uint64(seed & 0xFFFF_FFFF)
+        self._key = np.uint64(mix(np.uint64(seed & _LOW_64)))
         height, width = intrinsics.shape
         depths_m = np.arange(SIGMA_STEP_M, SIGMA_END_M, SIGMA_STEP_M)
         sigma_m = np.concatenate(([0.0], noise.sigma_of(depths_m, intrinsics)))
@@ -124,7 +127,7 @@ class DepthSensor:
         self._noise_grid = _grid(height, width, noise.smooth_px, noise.smooth_px)
         self._hole_grid = _grid(height, width, noise.hole_px, 2 * noise.hole_px)
         self._lasting_grid = np.empty_like(self._hole_grid)
-        fill_gauss(self._lasting_grid, np.uint64(mix(self._seed)), self._gauss)
+        fill_gauss(self._lasting_grid, self._key, self._gauss)
         self._smooth = np.empty(intrinsics.shape, dtype=np.float32)
         self._blobs = np.zeros(intrinsics.shape, dtype=np.float32)
         self._grown_m = np.empty(intrinsics.shape, dtype=np.float32)
@@ -135,7 +138,8 @@ class DepthSensor:
         `moment` is any integer that tells frames apart: equal moments of equally seeded sensors have equal noise.
         """
         noise, camera = self._noise, self._intrinsics
-        key = np.uint64(mix(self._seed ^ np.uint64(moment & 0xFFFF_FFFF_FFFF_FFFF)))
+        # Mixed twice, so that no moment of one seed is a moment of another.
+        key = np.uint64(mix(np.uint64(mix(self._key ^ np.uint64(moment & _LOW_64)))))
         fill_gauss(self._noise_grid, key, self._gauss)
         smooth_field(self._noise_grid, noise.smooth_px, noise.smooth_px, self._smooth)
         if noise.hole_share or noise.halo_m:

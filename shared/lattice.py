@@ -61,12 +61,13 @@ class Lattice:
         """
         low = np.asarray(box_min_m, dtype=np.float64)
         high = np.asarray(box_max_m, dtype=np.float64)
-        if low.shape != (3,) or high.shape != (3,) or not (high > low).all():
-            raise InputError(f"box: expected min below max on three axes, got {low} to {high}")
+        if low.shape != (3,) or high.shape != (3,) or not (high > low).all() or not np.isfinite((low, high)).all():
+            raise InputError(f"box: expected min below max on three axes, got {low.tolist()} to {high.tolist()}")
         if not voxel_size_m > 0.0:
             raise InputError(f"voxel_size_m: expected a positive length, got {voxel_size_m}")
-        counts = np.ceil((high - low) / voxel_size_m - EDGE_TOLERANCE).astype(np.int64)
-        counts = np.maximum(counts, 1)
+        counts = np.ceil((high - low) / voxel_size_m - EDGE_TOLERANCE)
+        # Both ends fit an int64; a number of voxels near the upper one is refused below.
+        counts = np.clip(counts, 1, 2**53).astype(np.int64)
         return cls(
             (float(low[0]), float(low[1]), float(low[2])),
             voxel_size_m,

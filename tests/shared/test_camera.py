@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from shared.camera import Intrinsics
+from shared.errors import InputError
+
+D435 = Intrinsics(848, 480, 421.5, 420.9, 424.2, 239.8)
+
+sizes = st.integers(1, 24)
+focal_lengths = st.floats(1.0, 2000.0)
+centres = st.floats(-100.0, 100.0)
+cameras = st.builds(Intrinsics, sizes, sizes, focal_lengths, focal_lengths, centres, centres, st.floats(1e-4, 1e-2))
+
+
+@given(cameras, st.data())
+def test_projection_undoes_deprojection(camera: Intrinsics, data: st.DataObject) -> None:
+    seed = data.draw(st.integers(0, 2**32 - 1))
+    depth = np.random.default_rng(seed).integers(1, 2**16, camera.shape, dtype=np.uint16)
+    points = camera.deproject(depth)
+    assert points.shape == (camera.height, camera.width, 3)
+    np.testing.assert_allclose(points[..., 2], depth * camera.depth_scale_m)
+    rows, columns = np.mgrid[0 : camera.height, 0 : camera.width]
+    np.testing.assert_allclose(camera.project(points), np.stack((columns, rows), axis=-1), atol=1e-6)
+
+
+def test_axes_are_optical_and_pixel_centres_are_integers() -> None:
+    camera = Intrinsics(5, 3, 2.0, 2.0, 2.0, 1.0)
+    points = camera.deproject(np.full((3, 5), 2000, dtype=np.uint16))
+    np.testing.assert_allclose(points[1, 2], [0.0, 0.0, 2.0])
+    np.testing.assert_allclose(points[1, 4], [2.0, 0.0, 2.0])
+    np.testing.assert_allclose(points[2, 2], [0.0, 1.0, 2.0])
+
+
+def test_no_measurement_is_the_camera_itself() -> None:
+    np.testing.assert_array_equal(D435.deproject(np.zeros(D435.shape, dtype=np.uint16)), 0.0)
+
+
+def test_stereo_noise_follows_the_imagers_not_the_picture() -> None:
+    # At 2 m, 0.1 px of disparity of a 50 mm baseline at 420 px is 19 mm.
+    assert D435.disparity_noise_m(0.1) * 2.0**2 == pytest.approx(0.019, rel=0.01)
+    assert D435.stereo_focal_px == D435.fx
+    aligned = Intrinsics(1280, 720, 908.3, 908.3, 643.0, 372.7, fx_stereo=640.0)
+    assert aligned.stereo_focal_px == 640.0
+    assert aligned.disparity_noise_m(0.1) == pytest.approx(0.1 / (640.0 * 0.05))
+
+
+def test_depth_images_are_checked() -> None:
+    good = np.zeros((480, 848), dtype=np.uint16)
+    assert D435.check_depth(good) is good
+    turned = D435.check_depth(np.asfortranarray(good))
+    assert turned.flags.c_contiguous
+    for wrong, words in (
+        (None, "expected a numpy array, got NoneType"),
+        (good.astype(np.float32), r"expected dtype uint16 \(units of depth_scale_m\), got float32"),
+        (good.astype(">u2"), "expected dtype uint16"),
+        (good.T, r"expected shape \(480, 848\) \(height, width\), got \(848, 480\)"),
+        (good[None], "expected shape"),
+    ):
+        with pytest.raises(InputError, match=f"^depth: {words}"):
+            D435.check_depth(wrong)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"width": 0},
+        {"width": 5000},
+        {"height": -1},
+        {"fx": 0.0},
+        {"fy": float("nan")},
+        {"cx": float("inf")},
+        {"depth_scale_m": 0.0},
+        {"depth_scale_m": 1.0},
+        {"stereo_baseline_m": 0.0},
+        {"fx_stereo": -1.0},
+        {"skew": 0.0},
+    ],
+)
+def test_impossible_cameras_are_refused(change: dict[str, float]) -> None:
+    with pytest.raises(ValidationError, match=next(iter(change))):
+        Intrinsics.model_validate({**D435.model_dump(), **change})
+
+
+def test_camera_travels_and_cannot_be_changed() -> None:
+    assert Intrinsics.model_validate_json(D435.model_dump_json()) == D435
+    with pytest.raises(ValidationError, match="frozen"):
+        D435.fx = 1.0  # type: ignore[misc]

@@ -111,9 +111,8 @@ class Cell:
         low = np.array(self.box_min_m, dtype=np.float64)
         high = np.array(self.box_max_m, dtype=np.float64)
         if low.shape != (3,) or high.shape != (3,) or not np.isfinite((low, high)).all() or (high <= low).any():
-            raise CellError(
-                f"cell {self.name}: expected box_max_m above box_min_m on three axes, got {low.tolist()} to {high.tolist()}"
-            )
+            span = f"{low.tolist()} to {high.tolist()}"
+            raise CellError(f"cell {self.name}: expected box_max_m above box_min_m on three axes, got {span}")
         names = [body.name for body in (*self.static, *self.objects)]
         if len(set(names)) != len(names):
             raise CellError(f"cell {self.name}: expected each name once among static and objects, got {names}")

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from shared.errors import MeshError
@@ -227,25 +226,31 @@ def mesh_by_hash(meshes: Mapping[str, bytes], sha256: str, name: str) -> Triangl
 
 def box_mesh(name: str, size_m: ArrayLike) -> TriangleMesh:
     """A box about the origin, `size_m` (3,) its edges."""
-    return _primitive(name, trimesh.creation.box(extents=np.asarray(size_m, dtype=np.float64)))
+    return _primitive(name, "box", extents=np.asarray(size_m, dtype=np.float64))
 
 
 def cylinder_mesh(name: str, radius_m: float, length_m: float) -> TriangleMesh:
     """A cylinder about the origin along z."""
-    return _primitive(name, trimesh.creation.cylinder(radius=radius_m, height=length_m, sections=CIRCLE_SEGMENTS))
+    return _primitive(name, "cylinder", radius=radius_m, height=length_m, sections=CIRCLE_SEGMENTS)
 
 
 def sphere_mesh(name: str, radius_m: float) -> TriangleMesh:
     """A sphere about the origin."""
-    return _primitive(name, trimesh.creation.icosphere(subdivisions=3, radius=radius_m))
+    return _primitive(name, "icosphere", subdivisions=3, radius=radius_m)
 
 
-def _primitive(name: str, shape: trimesh.Trimesh) -> TriangleMesh:
+def _primitive(name: str, kind: str, **sizes: Any) -> TriangleMesh:
+    import trimesh
+
+    shape = getattr(trimesh.creation, kind)(**sizes)
     return TriangleMesh.of_triangles(name, np.asarray(shape.vertices), np.asarray(shape.faces))
 
 
 def _read_triangles(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Vertices and faces of all parts of a file, in the file's unit (COLLADA: metres)."""
+    # Half a second of imports, which a unit need not pay: it is sent its meshes as bytes.
+    import trimesh
+
     try:
         scene = trimesh.load_scene(file, process=False, skip_materials=True)
         parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shared.camera import Intrinsics
 from shared.lattice import Lattice
-from shared.transforms import Transform, apply, identity, look_at
+from shared.transforms import Transform, apply, identity, inverse, look_at
 from simulation.camera import SimulatedCamera, d435i_intrinsics, rig
 from simulation.depth_noise import DepthNoise
 from simulation.scene import Owner, View
@@ -33,8 +33,11 @@ def random_view(seed: int) -> View:
 
 def points_world(z_m: NDArray[Any], pose: Transform) -> NDArray[np.float64]:
     v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width]
-    points = np.stack(((u - CAMERA.cx) / CAMERA.fx * z_m, (v - CAMERA.cy) / CAMERA.fy * z_m, z_m), axis=-1)
-    return apply(pose, points.astype(np.float64))
+    points = np.empty((*CAMERA.shape, 3))
+    points[..., 0] = (u - CAMERA.cx) / CAMERA.fx * z_m
+    points[..., 1] = (v - CAMERA.cy) / CAMERA.fy * z_m
+    points[..., 2] = z_m
+    return apply(pose, points)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -54,7 +57,7 @@ def test_visible_voxels_are_what_their_slow_twin_says(seed: int) -> None:
     np.add.at(total, LATTICE.keys(indices[counted]), 1)
     np.add.at(beyond, LATTICE.keys(indices[counted & (view.z_m < limit_m)]), 1)
     centres = LATTICE.centres(LATTICE.indices(np.arange(LATTICE.cell_count)))
-    depth_m = apply(np.linalg.inv(pose), centres)[:, 2]
+    depth_m = apply(inverse(pose), centres)[:, 2]
     enough = 0.1 * CAMERA.fx * CAMERA.fy * (LATTICE.voxel_size_m / np.maximum(depth_m, 1e-3)) ** 2
     expected = np.flatnonzero((total > 0) & (total >= enough))
     np.testing.assert_array_equal(truth.visible_keys, expected)

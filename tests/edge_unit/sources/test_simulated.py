@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated camera as a source: paced, latest wins, the same world for all."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from contextlib import aclosing
+from itertools import pairwise
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from edge_unit.sources.frame import DepthFrame, DepthSource
+from edge_unit.sources.simulated import SimulatedSource, SimulatedSourceConfig
+from shared.cell import Cell
+from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
+from shared.errors import SourceError
+from simulation.camera import SimulatedCamera, d435i_intrinsics, rig
+from simulation.truth import TruthFinder
+from simulation.world import DEMO_CELL, World
+
+WAIT_S = 20.0
+"""Kernels may have to be compiled first."""
+
+
+@pytest.fixture(scope="module")
+def cell() -> Cell:
+    return Cell.load(DEMO_CELL)
+
+
+async def take(source: DepthSource, count: int, pause_s: float = 0.0) -> list[DepthFrame]:
+    """The next frames, read by somebody who needs `pause_s` for each."""
+    found: list[DepthFrame] = []
+    async with aclosing(source.frames()) as frames:  # type: ignore[type-var]
+        async for frame in frames:
+            found.append(frame)
+            if len(found) == count:
+                break
+            await asyncio.sleep(pause_s)
+    return found
+
+
+async def test_frames_come_when_they_are_due_and_are_those_of_the_world(cell: Cell) -> None:
+    epoch_ns = monotonic_ns()
+    source = SimulatedSource(SimulatedSourceConfig(camera=1, fps=20.0, epoch_ns=epoch_ns, seed=3))
+    try:
+        info = await asyncio.wait_for(source.open(), WAIT_S)
+        opened_ns = monotonic_ns()
+        frames = await asyncio.wait_for(take(source, 4), WAIT_S)
+        taken_ns = monotonic_ns()
+    finally:
+        await source.close()
+    world = World.demo(people=1, seed=3, cell=cell)
+    assert info.serial == "SIM0000301"
+    assert info.intrinsics == d435i_intrinsics(424, 240)
+    np.testing.assert_array_equal(info.T_world_camera, rig(world.cell, 4)[1])
+    assert info.T_world_camera is not None
+    camera = SimulatedCamera(world, info.T_world_camera, info.intrinsics, seed=3 * 64 + 1)
+    for frame in frames:
+        assert frame.captured_at_ns == epoch_ns + frame.frame_number * 50 * NS_PER_MS
+        assert opened_ns <= frame.captured_at_ns <= taken_ns
+        assert frame.joints is None
+        expected = camera.capture((frame.captured_at_ns - epoch_ns) / NS_PER_S)
+        np.testing.assert_array_equal(frame.depth, expected.depth)
+    assert [b.frame_number > a.frame_number for a, b in pairwise(frames)] == [True] * 3
+
+
+async def test_a_slow_reader_skips_and_never_lags() -> None:
+    period_ns = NS_PER_S // 50
+    source = SimulatedSource(SimulatedSourceConfig(fps=50.0, epoch_ns=monotonic_ns()))
+    try:
+        await asyncio.wait_for(source.open(), WAIT_S)
+        ages_ns = []
+        numbers = []
+        async with aclosing(source.frames()) as frames:  # type: ignore[type-var]
+            async for frame in frames:
+                ages_ns.append(monotonic_ns() - frame.captured_at_ns)
+                numbers.append(frame.frame_number)
+                if len(numbers) == 4:
+                    break
+                await asyncio.sleep(0.1)
+    finally:
+        await source.close()
+    assert min(np.diff(numbers)) >= 4
+    # At most one period old when it was begun; the rest is rendering on a machine that may be busy.
+    assert min(ages_ns) < 3 * period_ns
+
+
+async def test_closing_ends_the_frames_and_it_opens_again() -> None:
+    source = SimulatedSource(SimulatedSourceConfig(fps=0.01, epoch_ns=monotonic_ns()))
+    await asyncio.wait_for(source.open(), WAIT_S)
+    waiting = asyncio.ensure_future(take(source, 1))
+    await asyncio.sleep(0)
+    await source.close()
+    assert await asyncio.wait_for(waiting, WAIT_S) == []
+    await source.close()
+    with pytest.raises(SourceError, match="to be opened before"):
+        await take(source, 1)
+    await asyncio.wait_for(source.open(), WAIT_S)
+    await source.close()
+
+
+async def test_truth_is_appended_frame_by_frame(cell: Cell, tmp_path: Path) -> None:
+    path = tmp_path / "truth.msgpack"
+    epoch_ns = monotonic_ns()
+    source = SimulatedSource(SimulatedSourceConfig(fps=30.0, epoch_ns=epoch_ns, truth_path=path))
+    try:
+        info = await asyncio.wait_for(source.open(), WAIT_S)
+        frames = await asyncio.wait_for(take(source, 3), WAIT_S)
+    finally:
+        await source.close()
+    unpacker = msgpack.Unpacker()
+    unpacker.feed(path.read_bytes())
+    records = list(unpacker)
+    assert [record["frame_number"] for record in records] == [frame.frame_number for frame in frames]
+    world = World.demo(people=1, seed=0, cell=cell)
+    assert info.T_world_camera is not None
+    camera = SimulatedCamera(world, info.T_world_camera, info.intrinsics)
+    finder = TruthFinder(info.intrinsics, info.T_world_camera, world.cell.lattice(0.05), camera.noise)
+    for record, frame in zip(records, frames, strict=True):
+        truth = finder.find(camera.look((frame.captured_at_ns - epoch_ns) / NS_PER_S))
+        assert record["captured_at_ns"] == frame.captured_at_ns
+        assert record["voxel_size_m"] == 0.05
+        np.testing.assert_array_equal(np.frombuffer(record["visible_keys"], "<u4"), truth.visible_keys)
+        np.testing.assert_array_equal(np.frombuffer(record["visible_counts"], "<u4"), truth.visible_counts)
+        np.testing.assert_array_equal(np.frombuffer(record["surface_keys"], "<u4"), truth.surface_keys)
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({"camera": 4, "cameras": 4}, "expected a camera below 4, got 4"),
+        ({"width": 100}, "resolution: expected one of"),
+        ({"cell": "/nowhere/cell.yaml"}, "/nowhere/cell.yaml"),
+        ({"truth_path": "/nowhere/truth"}, "truth_path: .*nowhere"),
+    ],
+)
+async def test_what_cannot_be_simulated_is_one_clear_error(settings: dict[str, object], text: str) -> None:
+    source = SimulatedSource(SimulatedSourceConfig.model_validate(settings))
+    with pytest.raises(SourceError, match=text):
+        await asyncio.wait_for(source.open(), WAIT_S)
+
+
+async def test_without_the_simulation_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "simulation.camera", None)
+    with pytest.raises(SourceError, match=r"pip install 'cellwatch\[sim\]'"):
+        await asyncio.wait_for(SimulatedSource(SimulatedSourceConfig()).open(), WAIT_S)
+
+
+@pytest.mark.parametrize("bad", [{"fps": 0.0}, {"people": 3}, {"seed": -1}, {"lens": 1}, {"kind": "realsense"}])
+def test_a_wrong_configuration_is_refused(bad: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        SimulatedSourceConfig.model_validate(bad)

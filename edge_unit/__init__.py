@@ -4,7 +4,6 @@
 In the order of the flow:
 
     jit_cache       where compiled kernels are kept, settled before the first is imported
-    config          the unit's own configuration
     kernels/        the arithmetic, as pure numba functions on arrays
     sources/        where frames come from
     inflation       how a mesh grows by a padding
@@ -15,8 +14,16 @@ In the order of the flow:
     health          does what the camera sees still fit what it should see
     pipeline        the method, one line a stage
     joints          the robot's joints at a frame's time
+    client          what a unit can ask the master
+    cell_cache      the master's cell, kept on disk
     uplink          the exchange with the master: latest wins
+    background      the learned reference, kept on disk
     trace           what was reported, frame by frame, in a file
+    config          the unit's own configuration
     unit            the daemon: source, pipeline and uplink held together
     __main__        the command line
 """
+
+from edge_unit.jit_cache import settle
+
+settle()

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a unit can ask the master, each call one request; errors of HTTP become ours here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+
+from shared.errors import ConfigError, MasterRefused, MasterUnreachable, WireError
+from shared.messages import (
+    InitializeAnswer,
+    InitializeRequest,
+    PoseAnswer,
+    PoseRequest,
+    RobotAnswer,
+    UpdateAnswer,
+    UpdateRequest,
+)
+from shared.transforms import Transform
+from shared.wire import MAX_ANSWER_BYTES, MEDIA_TYPE, decode, decode_update_answer, encode, encode_update, unpack
+
+TIMEOUT = httpx.Timeout(2.0, connect=1.0)
+"""A master that takes longer is as good as gone: the next frame is worth more than the answer to this one."""
+
+TRANSFER_TIMEOUT_S = 30.0
+"""For a mesh of MAX_MESH_BYTES over a network that is slow but works."""
+
+MAX_MESH_BYTES = 128 * 2**20
+"""Of one mesh; a robot link has a hundredth of it."""
+
+LIMITS = httpx.Limits(max_connections=4, max_keepalive_connections=4, keepalive_expiry=60.0)
+"""Update, joints, cell and pose may each be under way."""
+
+ERROR_CHARS = 300
+"""Of the master's reason."""
+
+
+class MasterClient:
+    """A connection to one master, kept open between calls."""
+
+    def __init__(self, url: str, read_token: Callable[[], str], source_address: str | None = None) -> None:
+        """`read_token` is asked when a connection is authorised anew; `source_address` is an own IP to connect from."""
+        self.url = url.rstrip("/")
+        self._read_token = read_token
+        parts = urlsplit(self.url)
+        if not parts.hostname:
+            raise ConfigError(f"master_url: expected http://host:port, got {url}")
+        self._http = httpx.AsyncClient(
+            base_url=self.url,
+            transport=httpx.AsyncHTTPTransport(local_address=source_address, limits=LIMITS),
+            timeout=TIMEOUT,
+            # No proxy from the environment: the master is on our own network.
+            trust_env=False,
+        )
+        # What httpx adds by itself costs bytes in every update and tells the master nothing.
+        self._http.headers = httpx.Headers({"Accept": MEDIA_TYPE})
+
+    async def __aenter__(self) -> MasterClient:
+        self.authorize()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._http.aclose()
+
+    def authorize(self) -> None:
+        """Read the token again.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        self._http.headers["Authorization"] = f"Bearer {self._read_token()}"
+
+    async def initialize(self, request: InitializeRequest) -> InitializeAnswer:
+        """Ask for a slot. Raises as `update`."""
+        return decode(InitializeAnswer, await self._call("POST", "/initialize", encode(request)))
+
+    async def update(self, update: UpdateRequest) -> UpdateAnswer:
+        """Report a frame.
+
+        Raises:
+            MasterUnreachable: nobody answered in time.
+            MasterRefused: the master said no; `status` tells how.
+            WireError: the answer is none of ours.
+        """
+        return decode_update_answer(await self._call("POST", "/update", encode_update(update)))
+
+    async def robot(self, since_ns: int, timeout_s: float) -> RobotAnswer:
+        """Joints after `since_ns` by the master's clock. Raises as `update`."""
+        data = await self._call("GET", f"/robot?since_ns={since_ns}", timeout=httpx.Timeout(timeout_s))
+        return decode(RobotAnswer, data)
+
+    async def put_pose(self, unit_id: int, T_world_camera: Transform, origin: str) -> int:
+        """Tell where the camera is; returns the version of the pose. Raises as `update`."""
+        request = PoseRequest.model_validate({"T_world_camera": T_world_camera.tolist(), "origin": origin})
+        data = await self._call("PUT", f"/units/{unit_id}/pose", encode(request))
+        return decode(PoseAnswer, data).pose
+
+    async def cell_document(self) -> dict[str, Any]:
+        """The cell's document. Raises as `update`."""
+        document = unpack(await self._call("GET", "/cell", timeout=TRANSFER_TIMEOUT_S), MAX_ANSWER_BYTES)
+        if not isinstance(document, dict):
+            raise WireError(f"cell: expected a document, got {type(document).__name__}")
+        return document
+
+    async def mesh(self, sha256: str) -> bytes:
+        """A mesh in its canonical bytes. Raises as `update`."""
+        return await self._call("GET", f"/cell/meshes/{sha256}", timeout=TRANSFER_TIMEOUT_S, limit=MAX_MESH_BYTES)
+
+    async def _call(
+        self,
+        method: str,
+        path: str,
+        body: bytes | None = None,
+        timeout: httpx.Timeout | float = TIMEOUT,
+        limit: int = MAX_ANSWER_BYTES,
+    ) -> bytes:
+        headers = {"Content-Type": MEDIA_TYPE} if body is not None else None
+        received = bytearray()
+        try:
+            async with self._http.stream(method, path, content=body, headers=headers, timeout=timeout) as response:
+                async for chunk in response.aiter_bytes():
+                    received += chunk
+                    if len(received) > limit:
+                        raise WireError(f"{self.url}{path}: expected at most {limit} bytes, got more")
+        except httpx.HTTPError as error:
+            raise MasterUnreachable(f"{self.url}{path}: {str(error) or type(error).__name__}") from error
+        if response.is_error:
+            raise MasterRefused(f"{self.url}{path}: {response.status_code}: {_reason(received)}", response.status_code)
+        return bytes(received)
+
+
+def _reason(body: bytearray) -> str:
+    """The one sentence of a refusal, whichever way it was encoded."""
+    text = bytes(body[:ERROR_CHARS]).decode("utf-8", "replace")
+    return text.removeprefix('{"detail":"').removesuffix('"}')

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The unit's own configuration; all else it is told by the master."""
+
+from __future__ import annotations
+
+import os
+from ipaddress import IPv4Address, IPv6Address
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, SecretStr, field_validator, model_validator
+
+from edge_unit.sources.recorded import RecordedSourceConfig, read_pose
+from edge_unit.sources.simulated import SimulatedSourceConfig
+from shared.errors import ConfigError
+from shared.transforms import Transform, from_xyz_rpy, validated
+
+ENVIRONMENT_PREFIX = "CELLWATCH_UNIT_"
+
+DEFAULT_MASTER_URL = "http://127.0.0.1:8420"
+
+MAX_FPS = 300.0
+"""No depth camera delivers more."""
+
+
+class Configured(BaseModel):
+    """Frozen; unknown names are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class PoseConfig(Configured):
+    """Where the camera is: `xyz` in m with `rpy_deg` (roll, pitch, yaw, fixed axes), a 4x4 `matrix`, or a `file`."""
+
+    xyz: tuple[float, float, float] | None = None
+    rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    matrix: tuple[tuple[float, float, float, float], ...] | None = None
+    file: Path | None = Field(default=None, description="Four rows of four numbers.")
+
+    @model_validator(mode="after")
+    def _one_of_them(self) -> PoseConfig:
+        if sum(given is not None for given in (self.xyz, self.matrix, self.file)) != 1:
+            raise ValueError("expected one of xyz (with rpy_deg), matrix, file")
+        return self
+
+    def transform(self) -> Transform:
+        """`T_world_camera`, optical frame.
+
+        Raises:
+            ConfigError: the file cannot be read.
+            InputError: it is no rigid transform.
+        """
+        if self.xyz is not None:
+            return from_xyz_rpy(self.xyz, np.radians(self.rpy_deg))
+        if self.matrix is not None:
+            return validated(self.matrix, "T_world_camera.matrix")
+        assert self.file is not None
+        return read_pose(self.file)
+
+
+SourceConfig = Annotated[RecordedSourceConfig | SimulatedSourceConfig, Field(discriminator="kind")]
+
+
+def default_state_dir() -> Path:
+    """Where a service manager, or else the user's own conventions, want state to be kept."""
+    if managed := os.environ.get("STATE_DIRECTORY"):
+        return Path(managed.split(":")[0])
+    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(home) / "cellwatch" / "edge-unit"
+
+
+class UnitConfig(Configured):
+    """From a YAML file, `CELLWATCH_UNIT_*` variables and flags. Only `source` has no default."""
+
+    source: SourceConfig
+    master_url: str = Field(default=DEFAULT_MASTER_URL, pattern=r"^https?://[^/\s]+/?$")
+    token: SecretStr | None = Field(default=None, description="The units' token itself ...")
+    token_file: Path | None = Field(default=None, description="... or the file that holds it.")
+    state_dir: Path = Field(default_factory=default_state_dir, description="For the cell and the learned background.")
+    jit_cache_dir: Path | None = Field(default=None, description="For compiled kernels.")
+    source_address: str | None = Field(default=None, description="Own IP address to connect from.")
+    T_world_camera: PoseConfig | None = Field(
+        default=None, description="The camera's pose, told to a master that has none for this unit."
+    )
+    learn_background_frames: int = Field(
+        default=0, ge=0, le=10_000, description="Learn the empty cell from so many frames, unless it is known already."
+    )
+    fps_max: float | None = Field(default=None, gt=0.0, le=MAX_FPS, description="Frames beyond are passed over.")
+    trace_path: Path | None = Field(default=None, description="Where each frame's result is written, for evaluation.")
+
+    @field_validator("source_address")
+    @classmethod
+    def _is_address(cls, value: str | None) -> str | None:
+        if value is not None:
+            _ = IPv6Address(value) if ":" in value else IPv4Address(value)
+        return value
+
+    @model_validator(mode="after")
+    def _one_token(self) -> UnitConfig:
+        if self.token is not None and self.token_file is not None:
+            raise ValueError("expected token or token_file, got both")
+        return self
+
+    def read_token(self) -> str:
+        """The units' token, read anew each time, so that it can be replaced while the unit runs.
+
+        Raises:
+            ConfigError: there is none, or its file cannot be read.
+        """
+        if self.token is not None:
+            return self.token.get_secret_value()
+        if self.token_file is None:
+            raise ConfigError("token: expected token or token_file in the configuration, got neither")
+        try:
+            token = self.token_file.read_text(encoding="ascii").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"token_file {self.token_file}: cannot be read: {error}") from error
+        if not token:
+            raise ConfigError(f"token_file {self.token_file}: expected a token, got an empty file")
+        return token

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where compiled kernels are kept, settled before the first is imported.
+
+numba looks for a folder that it can write when a kernel is *defined*, and raises when there is none; so a service
+without a home of its own would not even start. A folder that was filled before but is read-only counts as none.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import stat
+import sys
+import tempfile
+from pathlib import Path
+
+from shared.errors import JitCacheError
+
+logger = logging.getLogger(__name__)
+
+VARIABLES = ("CELLWATCH_JIT_CACHE", "NUMBA_CACHE_DIR")
+
+
+def settle(directory: Path | str | None = None) -> Path | None:
+    """Choose the folder for compiled kernels; call it before any kernel is imported.
+
+    `directory`, else `$CELLWATCH_JIT_CACHE`, else `$NUMBA_CACHE_DIR`, else numba's own choice, if it can be written;
+    else a private temporary folder, with a warning. Returns the folder, or None where numba chooses.
+
+    Raises:
+        JitCacheError: not even a temporary folder can be made.
+    """
+    wanted = next((Path(name) for name in (directory, *map(os.environ.get, VARIABLES)) if name), None)
+    if wanted is not None and _writable(wanted):
+        return _use(wanted)
+    if wanted is None and any(_writable(folder) for folder in _numba_choices()):
+        return None
+    private = _private_folder()
+    logger.warning(
+        "compiled kernels are kept in %s, since %s cannot be written; set %s to a folder that can",
+        private,
+        wanted or " nor ".join(str(folder) for folder in _numba_choices()),
+        VARIABLES[0],
+    )
+    return _use(private)
+
+
+def _use(folder: Path) -> Path:
+    os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    if "numba" in sys.modules:
+        # It reads the variable only when it is imported.
+        import numba
+
+        numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]  # numba sets its options from outside
+    return folder
+
+
+def _numba_choices() -> list[Path]:
+    """Where numba looks by itself: beside the source, then in the user's cache."""
+    beside = Path(__file__).parent / "kernels" / "__pycache__"
+    cache_home = os.environ.get("XDG_CACHE_HOME")
+    try:
+        return [beside, Path(cache_home) / "numba" if cache_home else Path.home() / ".cache" / "numba"]
+    except RuntimeError:  # a user without a home
+        return [beside]
+
+
+def _writable(folder: Path) -> bool:
+    """Whether a file can really be made there; permissions alone do not tell of read-only file systems."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+def _private_folder() -> Path:
+    """A folder that only this user can have filled, the same at each start where possible: kernels are code."""
+    try:
+        folder = Path(tempfile.gettempdir()) / f"cellwatch-jit-{os.getuid()}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+        if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077:
+            return folder
+        return Path(tempfile.mkdtemp(prefix="cellwatch-jit-"))
+    except OSError as error:
+        raise JitCacheError(f"no folder for compiled kernels can be made, not even a temporary one: {error}") from error

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot's joints at a frame's time, and how far they may be off."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.messages import JointSample
+
+HISTORY_SAMPLES = 512
+"""Four seconds at one sample in 8 ms, which is what the master sends; frames are far younger."""
+
+ACCELERATION_MAX = 5.0
+"""rad/s2 (or m/s2) that a robot at work is expected to reach; what it does beyond is reported as an obstacle."""
+
+SPEED_MAX = 2.0
+"""rad/s (or m/s) allowed for while nothing is known of a joint's speed."""
+
+EXTRAPOLATION_MAX_S = 0.2
+"""Beyond, the padding would have to grow by 0.1 rad: the robot would hide whoever stands beside it."""
+
+CAPTURE_UNCERTAINTY_NS = 2 * NS_PER_MS
+"""Exposure, and the path of a frame from the sensor to its time stamp."""
+
+NEGLIGIBLE = 1e-3
+"""rad (or m): a millimetre at a metre, well within the padding. A robot at rest then stays as it was drawn."""
+
+SPEED_SPAN_NS = 4 * NS_PER_MS
+"""Speed is taken over at least this span, since samples come with jitter."""
+
+
+@dataclass(frozen=True)
+class JointEstimate:
+    """Positions (n,) in rad (m where prismatic), and how far each may be off, (n,)."""
+
+    positions: NDArray[np.float64]
+    uncertainty: NDArray[np.float64]
+
+
+class JointHistory:
+    """The last few joint samples, all times by the master's clock."""
+
+    def __init__(self) -> None:
+        self._samples: deque[JointSample] = deque(maxlen=HISTORY_SAMPLES)
+
+    def add(self, samples: Iterable[JointSample]) -> None:
+        """Take in samples, oldest first; what is known already is passed over."""
+        for sample in samples:
+            if sample.at_ns > self.newest_ns:
+                if self._samples and len(sample.positions) != len(self._samples[-1].positions):
+                    self._samples.clear()
+                self._samples.append(sample)
+
+    def clear(self) -> None:
+        """Forget all: another master has another clock."""
+        self._samples.clear()
+
+    @property
+    def newest_ns(self) -> int:
+        """Time of the newest sample; 0 when there is none."""
+        return self._samples[-1].at_ns if self._samples else 0
+
+    def at(self, at_ns: int, clock_uncertainty_ns: int, stale_after_s: float) -> JointEstimate | None:
+        """Where the joints were at `at_ns`; None when nothing near enough in time is known.
+
+        Between two samples it interpolates; after the newest it goes on at the last speed, for at most
+        `EXTRAPOLATION_MAX_S`, and what the robot's acceleration can change meanwhile is added to the uncertainty.
+        """
+        newer: JointSample | None = None
+        for sample in reversed(self._samples):
+            if sample.at_ns <= at_ns:
+                if newer is not None:
+                    return self._between(sample, newer, at_ns, clock_uncertainty_ns)
+                return self._after(sample, at_ns, clock_uncertainty_ns, stale_after_s)
+            newer = sample
+        return None
+
+    def _between(self, before: JointSample, after: JointSample, at_ns: int, clock_uncertainty_ns: int) -> JointEstimate:
+        gap_s = (after.at_ns - before.at_ns) / NS_PER_S
+        first, last = np.array(before.positions), np.array(after.positions)
+        speed = np.abs(last - first) / gap_s
+        share = (at_ns - before.at_ns) / (after.at_ns - before.at_ns)
+        # A parabola of this acceleration is at most so far from its chord.
+        bow = ACCELERATION_MAX * gap_s**2 / 8.0
+        return _estimate(first + share * (last - first), speed, bow, clock_uncertainty_ns)
+
+    def _after(
+        self, newest: JointSample, at_ns: int, clock_uncertainty_ns: int, stale_after_s: float
+    ) -> JointEstimate | None:
+        ahead_s = (at_ns - newest.at_ns) / NS_PER_S
+        if ahead_s > min(stale_after_s, EXTRAPOLATION_MAX_S):
+            return None
+        velocity = self._velocity()
+        drift = ACCELERATION_MAX * ahead_s**2 / 2.0
+        if velocity is None:
+            velocity, drift = np.zeros(len(newest.positions)), drift + SPEED_MAX * ahead_s
+        positions = np.array(newest.positions) + velocity * ahead_s
+        return _estimate(positions, np.abs(velocity), drift, clock_uncertainty_ns)
+
+    def _velocity(self) -> NDArray[np.float64] | None:
+        """Of the newest sample: as the robot tells it, or from the sample before; None when neither is there."""
+        newest = self._samples[-1]
+        if newest.velocities is not None:
+            return np.array(newest.velocities)
+        for sample in reversed(self._samples):
+            span_ns = newest.at_ns - sample.at_ns
+            if span_ns >= SPEED_SPAN_NS:
+                if span_ns > EXTRAPOLATION_MAX_S * NS_PER_S:
+                    return None
+                moved: NDArray[np.float64] = np.subtract(newest.positions, sample.positions)
+                return moved / (span_ns / NS_PER_S)
+        return None
+
+
+def _estimate(
+    positions: NDArray[np.float64], speed: NDArray[np.float64], drift: float, clock_uncertainty_ns: int
+) -> JointEstimate:
+    time_s = (clock_uncertainty_ns + CAPTURE_UNCERTAINTY_NS) / NS_PER_S
+    uncertainty = drift + speed * time_s
+    return JointEstimate(positions, np.where(uncertainty < NEGLIGIBLE, 0.0, uncertainty))

@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folder of depth images played as if a camera took them now.
+
+Every frame is delivered once, in order, however slow the reader: a recording is for looking closely, and unlike a
+camera it can wait. Capture times are those of the delivery.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import re
+import zipfile
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from edge_unit.sources.frame import CameraInfo, DepthFrame
+from shared.camera import D435_BASELINE_M, Intrinsics
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.configuration import sentence
+from shared.errors import CellwatchError, ConfigError, InputError, SourceError
+from shared.transforms import Transform, validated
+
+SUFFIXES = (".png", ".npz", ".npy")
+
+NPZ_NAME = "depth"
+"""The array in an npz; any name will do when it is the only one."""
+
+MAX_FILE_BYTES = 256 * 2**20
+"""Of one image: many times the largest camera's, so that a wrong file does not fill the memory."""
+
+
+MAX_FRAMES = 100_000
+"""Of a recording, named one by one; two hours at 15 fps."""
+
+ExpandedPath = Annotated[Path, BeforeValidator(lambda value: os.path.expandvars(os.path.expanduser(value)))]
+"""May begin with `~` or a variable such as `$CELLWATCH_DATA`."""
+
+
+class RecordedSourceConfig(BaseModel):
+    """A folder of 16-bit PNG or npz depth images, with the camera's intrinsics, and its pose and joints if known."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    kind: Literal["recorded"] = "recorded"
+    folder: ExpandedPath = Field(description="With `depth/` (or the images themselves) and `camera_info.yaml`.")
+    frames: tuple[str | int, ...] | None = Field(
+        default=None, max_length=MAX_FRAMES, description="Names or numbers, in the order to be played; absent: all."
+    )
+    fps: float | None = Field(default=None, gt=0.0, le=300.0, description="Absent: as fast as they are taken.")
+    loop: bool = Field(default=False, description="Begin again at the end.")
+    depth_scale_m: float = Field(default=0.001, ge=1e-6, le=0.1)
+    fx_stereo: float | None = Field(default=None, gt=0.0, description="Focal length at which the imagers match.")
+    stereo_baseline_m: float = Field(default=D435_BASELINE_M, ge=0.005, le=1.0)
+    serial: str | None = Field(default=None, min_length=1, max_length=200, description="Absent: the folder's name.")
+    camera_info: str = "camera_info.yaml"
+    pose: str = Field(default="T_base_optical.txt", description="T_world_camera; none where there is no such file.")
+    joints: str = Field(default="joint_states_rad.csv", description="A row a frame; none where there is no such file.")
+
+
+class _RosCameraInfo(BaseModel):
+    """What we need of a `sensor_msgs/CameraInfo` as YAML; the rest of it is passed over."""
+
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+
+    width: int
+    height: int
+    k: list[float] = Field(min_length=9, max_length=9)
+    d: list[float] = []
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """All of a recording but its images."""
+
+    info: CameraInfo
+    files: tuple[Path, ...]
+    joints: tuple[NDArray[np.float64] | None, ...]
+
+
+class RecordedSource:
+    """A `DepthSource` of a folder."""
+
+    def __init__(self, config: RecordedSourceConfig) -> None:
+        self._config = config
+        self._recording: _Recording | None = None
+
+    async def open(self) -> CameraInfo:
+        """Look at the folder.
+
+        Raises:
+            SourceError: something is missing or malformed; names the file.
+        """
+        self._recording = await asyncio.to_thread(_open, self._config)
+        return self._recording.info
+
+    async def frames(self) -> AsyncIterator[DepthFrame]:
+        """The frames in order, at the configured rate; ends at the end unless it loops.
+
+        Raises:
+            SourceError: it is not open, or an image cannot be read or does not fit.
+        """
+        recording = self._recording
+        if recording is None:
+            raise SourceError(f"{self._config.folder}: frames were asked for before it was opened")
+        period_ns = 0 if self._config.fps is None else round(NS_PER_S / self._config.fps)
+        number, due_ns = 0, monotonic_ns()
+        while True:
+            for file, joints in zip(recording.files, recording.joints, strict=True):
+                depth = await asyncio.to_thread(_read_image, file, recording.info.intrinsics)
+                if (wait_ns := due_ns - monotonic_ns()) > 0:
+                    await asyncio.sleep(wait_ns / NS_PER_S)
+                captured_at_ns = monotonic_ns()
+                yield DepthFrame(depth, captured_at_ns, number, joints)
+                number += 1
+                # A reader that was late does not make the frames behind it hurry.
+                due_ns = max(due_ns + period_ns, captured_at_ns)
+            if not self._config.loop:
+                return
+
+    async def close(self) -> None:
+        """Nothing is held."""
+        self._recording = None
+
+
+def read_pose(path: Path) -> Transform:
+    """A 4x4 matrix from a text file.
+
+    Raises:
+        ConfigError: it cannot be read, or holds no rigid transform; names the file.
+    """
+    try:
+        return validated(np.loadtxt(path, ndmin=2), "T_world_camera")
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def _open(config: RecordedSourceConfig) -> _Recording:
+    folder = config.folder
+    if not folder.is_dir():
+        raise SourceError(f"{folder}: expected the folder of a recording, and there is none")
+    images = folder / "depth" if (folder / "depth").is_dir() else folder
+    every = sorted((path for path in images.iterdir() if path.suffix in SUFFIXES), key=_place)
+    if not every:
+        raise SourceError(f"{images}: expected depth images ({', '.join(SUFFIXES)}), and there are none")
+    files = every if config.frames is None else [_named(images, every, name) for name in config.frames]
+    pose, joints = folder / config.pose, folder / config.joints
+    try:
+        info = CameraInfo(
+            config.serial or folder.name,
+            "recorded",
+            _intrinsics(folder / config.camera_info, config),
+            read_pose(pose) if pose.is_file() else None,
+        )
+    except SourceError:
+        raise
+    except CellwatchError as error:
+        raise SourceError(str(error)) from error
+    rows = _joints(joints, len(every)) if joints.is_file() else None
+    return _Recording(info, tuple(files), tuple(None if rows is None else rows[every.index(file)] for file in files))
+
+
+def _place(path: Path) -> list[str | int]:
+    """Sorts frame 10 after frame 9."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"([0-9]+)", path.name)]
+
+
+def _named(images: Path, every: list[Path], name: str | int) -> Path:
+    """The file of that stem, or the one at that place."""
+    for file in every:
+        if str(name) in (file.stem, file.name):
+            return file
+    if isinstance(name, int) and 0 <= name < len(every):
+        return every[name]
+    raise SourceError(f"{images}: no frame {name!r}; expected names such as {every[0].stem}, or 0 to {len(every) - 1}")
+
+
+def _intrinsics(path: Path, config: RecordedSourceConfig) -> Intrinsics:
+    try:
+        found = _RosCameraInfo.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+        if any(found.d):
+            raise SourceError(f"{path}: expected an image without distortion, got d = {found.d}; rectify it first")
+        return Intrinsics(
+            width=found.width,
+            height=found.height,
+            fx=found.k[0],
+            fy=found.k[4],
+            cx=found.k[2],
+            cy=found.k[5],
+            depth_scale_m=config.depth_scale_m,
+            stereo_baseline_m=config.stereo_baseline_m,
+            fx_stereo=config.fx_stereo,
+        )
+    except ValidationError as error:
+        raise SourceError(f"{path}: {sentence(error)}") from error
+    except yaml.YAMLError as error:
+        raise SourceError(f"{path}: no YAML: {' '.join(str(error).split())}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f"{path}: cannot be read: {error}") from error
+
+
+def _joints(path: Path, frame_count: int) -> NDArray[np.float64]:
+    """Joint positions (frames, n)."""
+    try:
+        rows: NDArray[np.float64] = np.loadtxt(path, delimiter=",", ndmin=2)
+    except (OSError, ValueError) as error:
+        raise SourceError(f"{path}: expected a row of numbers for each frame: {error}") from error
+    if len(rows) != frame_count:
+        raise SourceError(f"{path}: expected {frame_count} rows, one for each depth image, got {len(rows)}")
+    if not np.isfinite(rows).all():
+        raise SourceError(f"{path}: expected finite joint positions, got NaN or infinity")
+    return rows
+
+
+def _read_image(path: Path, intrinsics: Intrinsics) -> NDArray[np.uint16]:
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise SourceError(f"{path}: expected at most {MAX_FILE_BYTES} bytes")
+        depth = _decoded(path)
+        return intrinsics.check_depth(depth)
+    except InputError as error:
+        raise SourceError(f"{path}: {error}") from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise SourceError(f"{path}: cannot be read: {error}") from error
+
+
+def _decoded(path: Path) -> object:
+    if path.suffix == ".png":
+        encoded = np.fromfile(path, dtype=np.uint8)
+        image = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if encoded.size else None
+        if image is None:
+            raise SourceError(f"{path}: no PNG image")
+        return image
+    loaded = np.load(path, allow_pickle=False)
+    if isinstance(loaded, np.ndarray):
+        return loaded
+    with loaded:
+        names = loaded.files
+        if NPZ_NAME not in names and len(names) != 1:
+            raise SourceError(f"{path}: expected an array named {NPZ_NAME}, got {', '.join(names) or 'none'}")
+        return loaded[NPZ_NAME if NPZ_NAME in names else names[0]]

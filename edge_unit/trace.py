@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What was reported, frame by frame, in a file for evaluation.
+
+A file of msgpack maps, one after the other: `frame_number, captured_at_ns` (the unit's clock), `process_ms`, `keys`
+(ascending little-endian uint32), `shape` and `voxel_size_m` of their lattice, `sent` (false: a newer frame took its
+place before it was sent), and of those that were sent `merged_at_ns`, when the master had merged it, by the unit's
+clock.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgpack
+
+from shared.errors import ConfigError
+
+logger = logging.getLogger(__name__)
+
+MAX_TRACE_BYTES = 2**30
+"""Days of an ordinary cell; a trace that was forgotten must not fill the disk."""
+
+MAX_PENDING = 256
+"""Records kept until they are written, at the next frame."""
+
+
+@dataclass(frozen=True)
+class TraceRecord:
+    """One frame."""
+
+    frame_number: int
+    captured_at_ns: int
+    process_ms: float
+    keys: bytes
+    shape: tuple[int, int, int]
+    voxel_size_m: float
+    sent: bool
+    merged_at_ns: int | None
+
+
+class Trace:
+    """Collects records on the event loop; `flush` writes them, from a thread."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises ConfigError when the file cannot be written."""
+        self._path = path
+        self._pending: deque[TraceRecord] = deque(maxlen=MAX_PENDING)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("wb")
+        except OSError as error:
+            raise ConfigError(f"trace_path {path}: cannot be written: {error.strerror}") from error
+        self._left = MAX_TRACE_BYTES
+
+    def add(self, record: TraceRecord) -> None:
+        """Keep a record for the next `flush`."""
+        self._pending.append(record)
+
+    def flush(self) -> None:
+        """Write what was collected; ends quietly at the file's bound."""
+        while self._pending:
+            packed: bytes = msgpack.packb(vars(self._pending.popleft()))
+            if len(packed) > self._left:
+                if self._left:
+                    logger.warning("%s: the trace ends here, it has reached %d bytes", self._path, MAX_TRACE_BYTES)
+                self._left = 0
+                continue
+            self._left -= len(packed)
+            self._file.write(packed)
+        self._file.flush()
+
+    def close(self) -> None:
+        """Write the rest."""
+        self.flush()
+        self._file.close()
+
+
+def read_trace(path: Path) -> list[TraceRecord]:
+    """The records of a trace; one that was cut short ends before its last.
+
+    Raises:
+        ConfigError: the file cannot be read, or is no trace.
+    """
+    records = []
+    try:
+        with path.open("rb") as file:
+            for fields in msgpack.Unpacker(file, use_list=False):
+                records.append(_record(fields))
+    except (OSError, ValueError, TypeError, msgpack.UnpackException) as error:
+        raise ConfigError(f"{path}: no trace: {error}") from error
+    return records
+
+
+def _record(fields: dict[str, Any]) -> TraceRecord:
+    return TraceRecord(**fields)

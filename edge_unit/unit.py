@@ -1,0 +1,356 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The daemon: source, pipeline and uplink held together.
+
+Frames are processed one after the other in a thread, while the event loop talks to the master. What the master
+changes (settings, cell, pose) is an `Assignment`, applied between two frames; a report carries the one that it was
+made with, so that nothing is ever merged under another lattice, cell or pose than it was made for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.metadata
+import logging
+from collections.abc import AsyncGenerator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edge_unit.background import BackgroundStore, Place
+from edge_unit.cell_cache import CellCache
+from edge_unit.client import MasterClient
+from edge_unit.config import SourceConfig, UnitConfig
+from edge_unit.joints import JointEstimate
+from edge_unit.pipeline import DepthPipeline
+from edge_unit.reference import ReferenceLearner
+from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
+from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
+from edge_unit.sources.simulated import SimulatedSource
+from edge_unit.trace import Trace, TraceRecord
+from edge_unit.uplink import Assignment, Report, Uplink
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.errors import InputError, SourceError
+from shared.messages import MAX_TEXT, MAX_VOXELS, Command, Health
+from shared.settings import FilterSettings
+from shared.transforms import Transform
+from shared.wire import keys_to_bytes
+
+logger = logging.getLogger(__name__)
+
+LEARN_FRAMES = 60
+"""Frames of the empty cell when an operator asks and the configuration names no number: four seconds at 15 fps."""
+
+REOPEN_MIN_S = 0.2
+REOPEN_MAX_S = 5.0
+"""Between attempts to open a camera that does not deliver."""
+
+DRAIN_S = 2.0
+"""For the last frame of a recording to reach the master."""
+
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
+
+@dataclass
+class _Learning:
+    """A background that is being learned."""
+
+    learner: ReferenceLearner
+    frames: int
+    command: Command | None
+
+
+class Unit:
+    """One camera, one master; `run` until cancelled or until a recording ends."""
+
+    def __init__(self, config: UnitConfig, source: DepthSource) -> None:
+        """Raises ConfigError when the trace cannot be written or the pose cannot be read."""
+        self._config = config
+        self._source = source
+        self._client = MasterClient(config.master_url, config.read_token, config.source_address)
+        configured = config.T_world_camera
+        self._pose = None if configured is None else (configured.transform(), "configured")
+        self._store = BackgroundStore(config.state_dir)
+        self._trace = None if config.trace_path is None else Trace(config.trace_path)
+        self._camera: CameraInfo | None = None
+        self._pipeline: DepthPipeline | None = None
+        self._applied: Assignment | None = None
+        self._learning: _Learning | None = None
+        self._next_at_ns = 0
+        self.uplink = Uplink(
+            self._client,
+            CellCache(config.state_dir / "cell"),
+            f"edge-unit {importlib.metadata.version('cellwatch')}",
+            _boot_id(),
+            self._note,
+        )
+
+    async def run(self) -> None:
+        """Watch and report.
+
+        Raises:
+            ConfigError: there is no token.
+            SourceError: a recording is missing or malformed.
+        """
+        async with self._client:
+            tasks = [asyncio.create_task(self.uplink.run()), asyncio.create_task(self._watch())]
+            try:
+                await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for task in tasks:
+                    task.cancel()
+                results = await asyncio.gather(*tasks, return_exceptions=True)
+                await asyncio.to_thread(self._close)
+            for result in results:
+                if isinstance(result, Exception):
+                    raise result
+
+    # ------------------------------------------------------------------ frames
+
+    async def _watch(self) -> None:
+        """Take frames for as long as there are any; a camera that fails is opened again."""
+        retry_s = REOPEN_MIN_S
+        while True:
+            try:
+                await self._open()
+                frames = self._source.frames()
+                try:
+                    async for frame in frames:
+                        retry_s = REOPEN_MIN_S
+                        await self._take(frame)
+                finally:
+                    if isinstance(frames, AsyncGenerator):
+                        await frames.aclose()
+                await self.uplink.drained(DRAIN_S)
+                return
+            except SourceError as error:
+                if isinstance(self._config.source, RecordedSourceConfig):
+                    raise
+                logger.warning("%s", error)
+                self.uplink.trouble = f"camera: {error}"[:MAX_TEXT]
+            finally:
+                await self._source.close()
+            await asyncio.sleep(retry_s)
+            retry_s = min(2.0 * retry_s, REOPEN_MAX_S)
+
+    async def _open(self) -> None:
+        camera = await self._source.open()
+        if self._camera is not None and camera.serial != self._camera.serial:
+            logger.warning("the camera changed from %s to %s", self._camera.serial, camera.serial)
+        self._camera, self._pipeline, self._applied = camera, None, None
+        pose = camera.T_world_camera
+        self.uplink.set_camera(camera, self._pose or (None if pose is None else (pose, "source")))
+        self.uplink.trouble = None
+        await self.uplink.assigned.wait()
+
+    async def _take(self, frame: DepthFrame) -> None:
+        """Process one frame and offer the result."""
+        if self._config.fps_max is not None:
+            if frame.captured_at_ns < self._next_at_ns:
+                return
+            self._next_at_ns = frame.captured_at_ns + round(0.9 * NS_PER_S / self._config.fps_max)
+        assignment = self.uplink.assignment or self._applied
+        if assignment is None:
+            return
+        if assignment.T_world_camera is None:
+            self._pipeline = None
+            self.uplink.offer(Report(assignment, frame.captured_at_ns, health=Health(frame=frame.frame_number)))
+            return
+        joints = await self._joints_at(assignment, frame)
+        commands = self._take_commands()
+        report = await asyncio.to_thread(self._process, assignment, assignment.T_world_camera, frame, joints, commands)
+        self.uplink.offer(report)
+
+    async def _joints_at(self, assignment: Assignment, frame: DepthFrame) -> JointEstimate | None:
+        """Where the robot was when the frame was taken; None when nobody knows."""
+        robot = assignment.cell.robot
+        if robot is None:
+            return None
+        if frame.joints is not None:
+            return JointEstimate(frame.joints, np.zeros(robot.joint_count))
+        clock = self.uplink.clock
+        if not clock.known:
+            return None
+        at_ns = frame.captured_at_ns + clock.offset_ns
+        await self.uplink.refresh_joints(at_ns)
+        uncertainty_ns = clock.uncertainty_ns(frame.captured_at_ns)
+        return self.uplink.joints.at(at_ns, uncertainty_ns, assignment.settings.robot_stale_after_s)
+
+    def _take_commands(self) -> list[Command]:
+        commands = []
+        while not self.uplink.commands.empty():
+            commands.append(self.uplink.commands.get_nowait())
+        return commands
+
+    # ------------------------------------------------------------------ in the thread
+
+    def _process(
+        self,
+        assignment: Assignment,
+        T_world_camera: Transform,
+        frame: DepthFrame,
+        joints: JointEstimate | None,
+        commands: list[Command],
+    ) -> Report:
+        """Everything about a frame that takes time."""
+        if self._trace is not None:
+            self._trace.flush()
+        try:
+            pipeline = self._prepared(assignment, T_world_camera)
+            for command in commands:
+                self._obey(command, pipeline)
+            if self._learning is not None:
+                return self._learn(self._learning, pipeline, assignment, frame, joints)
+            return _report(pipeline, assignment, frame, joints)
+        except InputError as error:
+            logger.warning("frame %d: %s", frame.frame_number, error)
+            return _troubled(assignment, frame, str(error))
+
+    def _prepared(self, assignment: Assignment, T_world_camera: Transform) -> DepthPipeline:
+        """The pipeline as the assignment has it."""
+        assert self._camera is not None
+        pipeline, applied = self._pipeline, self._applied
+        if pipeline is None or applied is None:
+            pipeline = DepthPipeline(
+                self._camera.intrinsics, T_world_camera, assignment.cell, _filter_settings(assignment)
+            )
+            # Compiles what is not in the cache yet, so that the first real frame is not late.
+            pipeline.process(np.zeros(self._camera.intrinsics.shape, np.uint16), None)
+            self._find_background(pipeline)
+        elif assignment is not applied:
+            if assignment.cell is not applied.cell:
+                pipeline.use_cell(assignment.cell)
+            if _filter_settings(assignment) != _filter_settings(applied):
+                pipeline.apply(_filter_settings(assignment))
+            if not np.array_equal(T_world_camera, pipeline.T_world_camera):
+                pipeline.move(T_world_camera)
+                self._find_background(pipeline)
+        self._pipeline, self._applied = pipeline, assignment
+        return pipeline
+
+    def _find_background(self, pipeline: DepthPipeline) -> None:
+        """What was learned at this place before, or else begin to learn if the configuration says so."""
+        self._learning = None
+        stored = self._store.load(self._place(pipeline))
+        if stored is not None:
+            logger.info("using the background learned before, from %d frames", stored.frames)
+            pipeline.use(stored)
+        elif self._config.learn_background_frames:
+            self._learning = _Learning(pipeline.learner(), self._config.learn_background_frames, None)
+
+    def _obey(self, command: Command, pipeline: DepthPipeline) -> None:
+        if command.verb == "learn_background":
+            frames = self._config.learn_background_frames or LEARN_FRAMES
+            pipeline.use(None)
+            self._learning = _Learning(pipeline.learner(), frames, command)
+        else:
+            self._learning = None
+            pipeline.use(None)
+            self._store.drop()
+            self.uplink.finish(command)
+
+    def _learn(
+        self,
+        learning: _Learning,
+        pipeline: DepthPipeline,
+        assignment: Assignment,
+        frame: DepthFrame,
+        joints: JointEstimate | None,
+    ) -> Report:
+        """Add a frame to the background; nothing is reported meanwhile."""
+        if assignment.cell.robot is not None and joints is None:
+            return _troubled(assignment, frame, "learning the background: it waits for the robot's joints")
+        pipeline.learn_frame(learning.learner, frame.depth, None if joints is None else joints.positions)
+        done = learning.learner.frames
+        if done < learning.frames:
+            return _troubled(assignment, frame, f"learning the background: frame {done} of {learning.frames}")
+        reference = learning.learner.reference()
+        pipeline.use(reference)
+        self._store.save(self._place(pipeline), reference)
+        if learning.command is not None:
+            self.uplink.finish(learning.command)
+        self._learning = None
+        logger.info("learned the background from %d frames: %.0f %% of it", done, 100.0 * reference.learned_share)
+        return _report(pipeline, assignment, frame, joints)
+
+    def _place(self, pipeline: DepthPipeline) -> Place:
+        assert self._camera is not None
+        return Place(self._camera, pipeline.T_world_camera)
+
+    # ------------------------------------------------------------------ the trace
+
+    def _note(self, report: Report, merged_at_ns: int | None) -> None:
+        """Remember what became of a report."""
+        if self._trace is None or report.captured_at_ns is None:
+            return
+        lattice = report.assignment.lattice
+        self._trace.add(
+            TraceRecord(
+                report.health.frame,
+                report.captured_at_ns,
+                report.health.process_ms,
+                report.keys,
+                lattice.shape,
+                lattice.voxel_size_m,
+                merged_at_ns is not None,
+                merged_at_ns,
+            )
+        )
+
+    def _close(self) -> None:
+        if self._trace is not None:
+            self._trace.close()
+
+
+def make_source(config: SourceConfig) -> DepthSource:
+    """The source that the configuration chose."""
+    if isinstance(config, RecordedSourceConfig):
+        return RecordedSource(config)
+    return SimulatedSource(config)
+
+
+def _report(
+    pipeline: DepthPipeline, assignment: Assignment, frame: DepthFrame, joints: JointEstimate | None
+) -> Report:
+    if joints is None:
+        voxels = pipeline.process(frame.depth, None)
+    else:
+        voxels = pipeline.process(frame.depth, joints.positions, joint_uncertainty_rad=joints.uncertainty)
+    if len(voxels) > MAX_VOXELS:
+        return _troubled(assignment, frame, f"{len(voxels)} obstacle voxels, more than an update can hold")
+    health = pipeline.health()
+    return Report(
+        assignment,
+        frame.captured_at_ns,
+        keys_to_bytes(voxels.keys),
+        pipeline.seen(),
+        Health(
+            valid_share=health.valid_share,
+            agreeing_share=health.agreeing_share,
+            residual_share=health.residual_share,
+            static_share=health.static_share,
+            process_ms=round(pipeline.last.total_ns / NS_PER_MS, 3),
+            frame=frame.frame_number,
+        ),
+    )
+
+
+def _troubled(assignment: Assignment, frame: DepthFrame, trouble: str) -> Report:
+    """A report that only says what is wrong: no voxels, nothing seen."""
+    health = Health(frame=frame.frame_number, trouble=trouble[:MAX_TEXT])
+    return Report(assignment, frame.captured_at_ns, health=health)
+
+
+def _filter_settings(assignment: Assignment) -> FilterSettings:
+    """The part of the settings that the pipeline works with."""
+    return FilterSettings.model_validate(assignment.settings.model_dump(include=set(FilterSettings.model_fields)))
+
+
+def _boot_id() -> str:
+    """Changes when the machine's monotonic clock starts anew."""
+    try:
+        return BOOT_ID.read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
+
+

@@ -1,0 +1,338 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The exchange with the master: register, then report the latest frame, for ever.
+
+A slot of one: a report that was not sent yet is replaced by a newer one, so that a slow network costs frames and
+never delay. Whatever goes wrong, it registers again; the master may have been restarted, or may be another.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+
+from edge_unit.cell_cache import CellCache
+from edge_unit.client import MasterClient
+from edge_unit.joints import JointHistory
+from edge_unit.sources.frame import CameraInfo
+from edge_unit.visibility import SeenBlocks
+from shared.cell import Cell
+from shared.clock import monotonic_ns
+from shared.errors import CellwatchError, ConfigError, MasterRefused
+from shared.lattice import Lattice
+from shared.messages import (
+    CONTRACT_VERSION,
+    MAX_COMMANDS,
+    Command,
+    Health,
+    InitializeRequest,
+    SeenReport,
+    UpdateAnswer,
+    UpdateRequest,
+    Versions,
+)
+from shared.settings import Settings
+from shared.timebase import ClockOffset, Exchange
+from shared.transforms import Transform, validated
+from shared.wire import pack_seen
+
+logger = logging.getLogger(__name__)
+
+HEARTBEAT_S = 0.2
+"""Without a new frame the last report is sent again, often enough for the shortest sensible staleness."""
+
+RETRY_MIN_S = 0.05
+RETRY_MAX_S = 0.5
+"""A master that returns has its units back within a second."""
+
+JOINTS_TIMEOUT_S = 0.02
+"""For joints newer than the last update brought; a frame is not held up longer for them."""
+
+START_OVER = frozenset({401, 403, 404, 409})
+"""The master does not know this token, unit, session or address any more: register again."""
+
+
+@dataclass(frozen=True, eq=False)
+class Assignment:
+    """What the master wants of this unit: all that a frame is processed with."""
+
+    session: int
+    versions: Versions
+    settings: Settings
+    lattice: Lattice
+    cell: Cell
+    T_world_camera: Transform | None
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """One frame's result, and the assignment that it was made with. `seen` is None when nothing is known to be seen."""
+
+    assignment: Assignment
+    captured_at_ns: int | None = None
+    keys: bytes = b""
+    seen: SeenBlocks | None = None
+    health: Health = field(default_factory=Health)
+
+
+class Uplink:
+    """Registers and reports in the background; `run` never returns."""
+
+    def __init__(
+        self,
+        client: MasterClient,
+        cells: CellCache,
+        software: str,
+        boot_id: str,
+        on_sent: Callable[[Report, int | None], None],
+    ) -> None:
+        """`on_sent` is told of each report: when the master had merged it, by the unit's clock; None: it never was."""
+        self._client = client
+        self._cells = cells
+        self._software = software
+        self._boot_id = boot_id
+        self._on_sent = on_sent
+        self._camera: CameraInfo | None = None
+        self._known_pose: tuple[Transform, str] | None = None
+        self._fresh: Report | None = None
+        self._last: Report | None = None
+        self._wake = asyncio.Event()
+        self._idle = asyncio.Event()
+        self._idle.set()
+        self._exchange: Exchange | None = None
+        self._acknowledged: tuple[Versions, bytes] | None = None
+        self._id = 0
+        self._sequence = 0
+        self._done: list[int] = []
+        self._open_commands: dict[int, Command] = {}
+        self.assignment: Assignment | None = None
+        self.assigned = asyncio.Event()
+        self.commands: asyncio.Queue[Command] = asyncio.Queue(MAX_COMMANDS)
+        self.joints = JointHistory()
+        self.clock = ClockOffset()
+        self.trouble: str | None = None
+
+    # ------------------------------------------------------------------ what the unit calls
+
+    def set_camera(self, camera: CameraInfo, known_pose: tuple[Transform, str] | None) -> None:
+        """This is the camera to register with; another one than before means registering again.
+
+        `known_pose` (`T_world_camera` and where it is from) is told to a master that knows none.
+        """
+        if self._camera is not None and (self._camera.serial, self._camera.intrinsics) != (
+            camera.serial,
+            camera.intrinsics,
+        ):
+            self._start_over()
+        self._camera = camera
+        self._known_pose = known_pose
+        self._wake.set()
+
+    def offer(self, report: Report) -> None:
+        """Report this next; what was offered before and not sent yet is dropped."""
+        if self._fresh is not None:
+            self._on_sent(self._fresh, None)
+        self._fresh = report
+        self._idle.clear()
+        self._wake.set()
+
+    def finish(self, command: Command) -> None:
+        """A command was carried out; the master is told with the next update."""
+        if command.id in self._open_commands:
+            self._done.append(command.id)
+
+    async def drained(self, timeout_s: float) -> None:
+        """Wait until nothing is left to be sent, but no longer than `timeout_s`."""
+        try:
+            await asyncio.wait_for(self._idle.wait(), timeout_s)
+        except asyncio.TimeoutError:
+            logger.warning("the last frame did not reach the master")
+
+    async def refresh_joints(self, at_master_ns: int) -> None:
+        """Ask for joints up to `at_master_ns` if none so new are known; what cannot be had in time is done without."""
+        if self.joints.newest_ns >= at_master_ns or self.assignment is None:
+            return
+        try:
+            answer = await self._client.robot(self.joints.newest_ns, JOINTS_TIMEOUT_S)
+        except CellwatchError as error:
+            logger.debug("no fresh joints: %s", error)
+        else:
+            self.joints.add(answer.joints)
+
+    # ------------------------------------------------------------------ the exchange
+
+    async def run(self) -> None:
+        """Register and report until cancelled."""
+        retry_s = RETRY_MIN_S
+        while True:
+            try:
+                assignment = self.assignment
+                if assignment is None:
+                    await self._register()
+                    retry_s = RETRY_MIN_S
+                    continue
+                await self._report(assignment)
+                retry_s = RETRY_MIN_S
+            except MasterRefused as error:
+                if error.status in START_OVER and self.assignment is not None:
+                    self._start_over()
+                retry_s = await self._wait(retry_s, error)
+            except CellwatchError as error:
+                retry_s = await self._wait(retry_s, error)
+
+    async def _register(self) -> None:
+        while self._camera is None:
+            self._wake.clear()
+            await self._wake.wait()
+        camera = self._camera
+        self._client.authorize()
+        sent_at_ns = monotonic_ns()
+        answer = await self._client.initialize(
+            InitializeRequest(
+                contract=CONTRACT_VERSION,
+                serial=camera.serial,
+                model=camera.model,
+                intrinsics=camera.intrinsics,
+                software=self._software,
+                boot_id=self._boot_id,
+                sent_at_ns=sent_at_ns,
+            )
+        )
+        self.clock = ClockOffset()
+        self.joints.clear()
+        self._exchange = Exchange(sent_at_ns, answer.received_at_ns, answer.answered_at_ns, monotonic_ns())
+        self.clock.add(self._exchange)
+        self.joints.add(answer.joints)
+        self._id = answer.id
+        self._sequence = 0
+        self._acknowledged = None
+        self._done.clear()
+        self._open_commands.clear()
+        cell = await self._cells.get(answer.cell, self._client)
+        pose = None if answer.T_world_camera is None else validated(answer.T_world_camera, "T_world_camera")
+        versions = answer.versions
+        if pose is None and self._known_pose is not None:
+            pose, origin = self._known_pose
+            version = await self._client.put_pose(answer.id, pose, origin)
+            versions = versions.model_copy(update={"pose": version})
+        self._assign(Assignment(answer.session, versions, answer.settings, answer.lattice.lattice(), cell, pose))
+        logger.info("registered at %s as unit %d", self._client.url, answer.id)
+
+    async def _report(self, assignment: Assignment) -> None:
+        """Send the latest report, or, when none comes, the one before again."""
+        if self._fresh is None:
+            self._wake.clear()
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), HEARTBEAT_S)
+        fresh, self._fresh = self._fresh, None
+        report = fresh or self._last or Report(assignment)
+        if report.assignment.session != assignment.session:
+            # Made for a session that is over, in which the same versions may have meant something else.
+            if fresh is not None:
+                self._on_sent(fresh, None)
+            report = Report(assignment, health=Health(trouble=self.trouble))
+        self._last = report
+        try:
+            answer, merged_at_ns = await self._exchange_update(assignment, report)
+        except CellwatchError:
+            if fresh is not None:
+                self._on_sent(fresh, None)
+            raise
+        finally:
+            if self._fresh is None:
+                self._idle.set()
+        if fresh is not None:
+            self._on_sent(fresh, merged_at_ns)
+        await self._follow(assignment, answer)
+
+    async def _exchange_update(self, assignment: Assignment, report: Report) -> tuple[UpdateAnswer, int]:
+        self._sequence += 1
+        versions = report.assignment.versions
+        seen_bits = report.seen.packed() if report.seen is not None else b""
+        seen = None
+        if report.seen is not None and self._acknowledged != (versions, seen_bits):
+            seen = seen_report(report.seen)
+        done = tuple(self._done[:MAX_COMMANDS])
+        health = report.health
+        if self.trouble is not None:
+            health = health.model_copy(update={"trouble": self.trouble})
+        sent_at_ns = monotonic_ns()
+        answer = await self._client.update(
+            UpdateRequest(
+                id=self._id,
+                session=assignment.session,
+                sequence=self._sequence,
+                captured_at_ns=report.captured_at_ns,
+                sent_at_ns=sent_at_ns,
+                exchange=self._exchange,
+                versions=versions,
+                keys=report.keys,
+                seen=seen,
+                health=health,
+                joints_until_ns=self.joints.newest_ns,
+                done=done,
+            )
+        )
+        self._exchange = Exchange(sent_at_ns, answer.received_at_ns, answer.answered_at_ns, monotonic_ns())
+        self.clock.add(self._exchange)
+        self.joints.add(answer.joints)
+        if report.seen is not None:
+            self._acknowledged = versions, seen_bits
+        self._forget_commands(done)
+        return answer, answer.answered_at_ns - self.clock.offset_ns
+
+    async def _follow(self, assignment: Assignment, answer: UpdateAnswer) -> None:
+        """Do what the master's answer asks for."""
+        self._accept_commands(answer.commands)
+        if answer.versions == assignment.versions:
+            return
+        changed = replace(assignment, versions=answer.versions)
+        if answer.settings is not None:
+            changed = replace(changed, settings=answer.settings)
+        if answer.lattice is not None:
+            changed = replace(changed, lattice=answer.lattice.lattice())
+        if answer.cell is not None:
+            changed = replace(changed, cell=await self._cells.get(answer.cell, self._client))
+        if answer.versions.pose != assignment.versions.pose:
+            pose = answer.T_world_camera
+            changed = replace(changed, T_world_camera=None if pose is None else validated(pose, "T_world_camera"))
+        self._assign(changed)
+
+    def _accept_commands(self, commands: Iterable[Command]) -> None:
+        for command in commands:
+            if command.id not in self._open_commands and not self.commands.full():
+                self._open_commands[command.id] = command
+                self.commands.put_nowait(command)
+
+    def _forget_commands(self, done: Iterable[int]) -> None:
+        for command_id in done:
+            self._done.remove(command_id)
+            self._open_commands.pop(command_id, None)
+
+    def _assign(self, assignment: Assignment) -> None:
+        self.assignment = assignment
+        self.assigned.set()
+
+    def _start_over(self) -> None:
+        self.assignment = None
+        self.assigned.clear()
+
+    async def _wait(self, retry_s: float, error: CellwatchError) -> float:
+        """Wait before the next attempt; returns how long to wait after that."""
+        level = logging.WARNING if retry_s == RETRY_MIN_S or isinstance(error, ConfigError) else logging.DEBUG
+        logger.log(level, "%s", error)
+        await asyncio.sleep(retry_s * random.uniform(0.8, 1.2))
+        return min(2.0 * retry_s, RETRY_MAX_S)
+
+
+def seen_report(seen: SeenBlocks) -> SeenReport:
+    """The blocks as a report, in larger ones where it would be too long."""
+    while True:
+        nx, ny, nz = seen.lattice.shape
+        report = pack_seen(seen.seen.reshape(nx, ny, nz), seen.lattice.voxel_size_m)
+        if report is not None:
+            return report
+        seen = seen.coarser()

@@ -17,8 +17,9 @@ from edge_unit.kernels.jit import kernel
 NOTHING_NEAREST = np.float32(0.0)
 """`nearest_w` of a pixel without a surface: infinitely far."""
 
-NOTHING_FARTHEST = np.float32(3e38)
-"""`farthest_w` of a pixel without a surface: infinitely near, so that any surface is farther."""
+NOTHING_FARTHEST = np.float32(1e6)
+"""`farthest_w` of a pixel without a surface: a micrometre away, so that any surface is farther. Not the largest float32:
+its inverse is subnormal, which costs a hundred cycles a pixel."""
 
 
 @kernel
@@ -116,20 +117,22 @@ def fill_clipped(
         z_i = corners[i, 2]
         z_j = corners[j, 2]
         if z_i >= near_m:
-            for k in range(3):
-                polygon[count, k] = corners[i, k]
+            # Rounded as `draw_mesh` rounds them: a neighbour that is not cut has the same corners.
+            w = 1.0 / z_i
+            polygon[count, 0] = np.float32(corners[i, 0] * w * fx + cx)
+            polygon[count, 1] = np.float32(corners[i, 1] * w * fy + cy)
+            polygon[count, 2] = np.float32(w)
             count += 1
         if (z_i >= near_m) != (z_j >= near_m):
-            share = (near_m - z_i) / (z_j - z_i)
-            for k in range(2):
-                polygon[count, k] = corners[i, k] + share * (corners[j, k] - corners[i, k])
-            polygon[count, 2] = near_m
+            # Always from the end in front, so that a neighbour that is cut too finds the same point.
+            front, back = (i, j) if z_i >= near_m else (j, i)
+            share = (near_m - corners[front, 2]) / (corners[back, 2] - corners[front, 2])
+            x = corners[front, 0] + share * (corners[back, 0] - corners[front, 0])
+            y = corners[front, 1] + share * (corners[back, 1] - corners[front, 1])
+            polygon[count, 0] = x / near_m * fx + cx
+            polygon[count, 1] = y / near_m * fy + cy
+            polygon[count, 2] = 1.0 / near_m
             count += 1
-    for i in range(count):
-        w = 1.0 / polygon[i, 2]
-        polygon[i, 0] = polygon[i, 0] * w * fx + cx
-        polygon[i, 1] = polygon[i, 1] * w * fy + cy
-        polygon[i, 2] = w
     for i in range(1, count - 1):
         u0, v0 = polygon[0, 0], polygon[0, 1]
         u1, v1 = polygon[i, 0], polygon[i, 1]
@@ -203,15 +206,16 @@ def draw_mesh(
     for face in range(len(faces)):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
         if screen[a, 5] >= near_m and screen[b, 5] >= near_m and screen[c, 5] >= near_m:
-            u0, v0 = screen[a, 0], screen[a, 1]
-            u1, v1 = screen[b, 0], screen[b, 1]
-            u2, v2 = screen[c, 0], screen[c, 1]
+            # In float64 as after clipping, so that neighbours agree on where their edge crosses a row.
+            u0, v0 = np.float64(screen[a, 0]), np.float64(screen[a, 1])
+            u1, v1 = np.float64(screen[b, 0]), np.float64(screen[b, 1])
+            u2, v2 = np.float64(screen[c, 0]), np.float64(screen[c, 1])
             if closed and (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0) >= 0.0:
                 continue
             fill_triangle(
-                u0, v0, screen[a, 2],
-                u1, v1, screen[b, 2],
-                u2, v2, screen[c, 2],
+                u0, v0, np.float64(screen[a, 2]),
+                u1, v1, np.float64(screen[b, 2]),
+                u2, v2, np.float64(screen[c, 2]),
                 nearest_w, farthest_w, rectangle,
             )  # fmt: skip
         elif screen[a, 5] >= near_m or screen[b, 5] >= near_m or screen[c, 5] >= near_m:

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from edge_unit.kernels.density import expected_angular, expected_pinhole, keep_dense, neighbourhood_count
+from shared.lattice import Lattice
+from shared.transforms import Transform, apply, from_xyz_rpy, inverse
+
+FX, FY = 320.0, 310.0
+DEGREES_PER_COLUMN, DEGREES_PER_ROW = 69.0 / 424.0, 42.0 / 240.0
+
+
+def kept(
+    counts: NDArray[np.uint32],
+    lattice: Lattice,
+    T_world_camera: Transform,
+    angular: bool = False,
+    single: bool = False,
+    threshold: float = 0.75,
+    own_share_min: float = 0.05,
+    area_max_m2: float = 0.0025,
+    touched: NDArray[np.uint32] | None = None,
+) -> set[int]:
+    if touched is None:
+        touched = np.nonzero(counts.ravel())[0].astype(np.uint32)
+    out = np.full(len(touched), 0xFFFFFFFF, np.uint32)
+    T_camera_world = inverse(T_world_camera)
+    number = keep_dense(
+        counts.ravel(),
+        touched,
+        len(touched),
+        np.array(lattice.shape, np.int32),
+        lattice.voxel_size_m,
+        apply(T_camera_world, lattice.centres(np.zeros(3))),
+        np.ascontiguousarray(T_camera_world[:3, :3] * lattice.voxel_size_m),
+        FX,
+        FY,
+        DEGREES_PER_COLUMN,
+        DEGREES_PER_ROW,
+        angular,
+        single,
+        threshold,
+        own_share_min,
+        area_max_m2,
+        out,
+    )
+    assert len(set(out[:number].tolist())) == number
+    return set(out[:number].tolist())
+
+
+def twin(
+    counts: NDArray[np.uint32],
+    lattice: Lattice,
+    T_world_camera: Transform,
+    angular: bool,
+    single: bool,
+    threshold: float,
+    own_share_min: float,
+    area_max_m2: float,
+) -> set[int]:
+    """All voxels at once, with scipy's convolution for the neighbourhood."""
+    size_m = lattice.voxel_size_m
+    centre_m = apply(inverse(T_world_camera), lattice.centres(np.moveaxis(np.indices(lattice.shape), 0, -1)))
+    if angular:
+        distance_m = np.maximum(np.linalg.norm(centre_m, axis=-1), 1e-3)
+        degrees = np.degrees(np.arctan(size_m / distance_m))
+        full = degrees / DEGREES_PER_COLUMN * (degrees / DEGREES_PER_ROW)
+    else:
+        full = FX * FY * (size_m / np.maximum(centre_m[..., 2], 1e-3)) ** 2
+    if single:
+        dense = counts >= threshold * full
+    else:
+        around = ndimage.convolve(counts.astype(np.int64), np.ones((3, 3, 3), np.int64), mode="constant")
+        share = min(area_max_m2 / size_m**2, 1.0)
+        dense = (around >= threshold * share * full) & (counts >= own_share_min * full)
+    return set(np.nonzero((dense & (counts > 0)).ravel())[0].tolist())
+
+
+@pytest.mark.parametrize("angular", [False, True])
+@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize("size_m", [0.01, 0.05, 0.1])
+@pytest.mark.parametrize("shape", [(12, 9, 7), (1, 1, 1), (40, 1, 2)])
+def test_keeps_what_the_twin_keeps(angular: bool, single: bool, size_m: float, shape: tuple[int, int, int]) -> None:
+    rng = np.random.default_rng(sum(shape) + int(1000 * size_m))
+    lattice = Lattice((-0.3, 0.1, -0.2), size_m, shape)
+    sizes = []
+    for _ in range(6):
+        # Some voxels lie behind the camera: then any count is enough of nothing.
+        pose = from_xyz_rpy(rng.normal(0.0, 0.6, 3), rng.uniform(-np.pi, np.pi, 3))
+        z_m = apply(inverse(pose), lattice.centres(np.moveaxis(np.indices(shape), 0, -1)))[..., 2]
+        full = FX * FY * (size_m / np.maximum(np.abs(z_m), 0.1)) ** 2
+        counts = rng.poisson(full * rng.uniform(0.0, 2.0, shape) * (rng.random(shape) < 0.5)).astype(np.uint32)
+        figures = (rng.uniform(0.05, 1.5), rng.uniform(0.0, 0.2), rng.uniform(1e-4, 0.01))
+        wanted = twin(counts, lattice, pose, angular, single, *figures)
+        assert kept(counts, lattice, pose, angular, single, *figures) == wanted
+        sizes.append(len(wanted) / max(np.count_nonzero(counts), 1))
+    assert shape == (1, 1, 1) or 0.05 < np.mean(sizes) < 1.0
+
+
+def test_nothing_touched() -> None:
+    lattice = Lattice((0, 0, 0), 0.05, (4, 5, 6))
+    assert kept(np.zeros(lattice.shape, np.uint32), lattice, from_xyz_rpy((0, 0, -1), (0, 0, 0))) == set()
+
+
+def test_the_neighbourhood_ends_at_the_lattice() -> None:
+    """A row's end is not the next row's beginning."""
+    shape = (3, 4, 5)
+    counts = np.random.default_rng(0).integers(0, 9, shape).astype(np.uint32)
+    around = ndimage.convolve(counts.astype(int), np.ones((3, 3, 3), int), mode="constant")
+    for index in np.ndindex(shape):
+        assert neighbourhood_count(counts.ravel(), *index, *shape) == around[index]
+
+
+def test_a_hand_on_a_border_survives_here_and_not_in_the_paper() -> None:
+    """Two layers of 45 % each: alone both are noise, together they are a hand."""
+    lattice = Lattice((-0.25, -0.25, 1.4), 0.05, (10, 10, 4))
+    pose = from_xyz_rpy((0, 0, 0), (0, 0, 0))
+    counts = np.zeros(lattice.shape, np.uint32)
+    counts[4:6, 4:6, 1:3] = round(0.45 * FX * FY * (0.05 / 1.5) ** 2)
+    assert len(kept(counts, lattice, pose)) == 8
+    assert kept(counts, lattice, pose, single=True, threshold=0.5) == set()
+
+
+def test_own_share_keeps_a_few_stray_points_beside_a_surface_out() -> None:
+    lattice = Lattice((-0.25, -0.25, 1.4), 0.05, (10, 10, 4))
+    counts = np.zeros(lattice.shape, np.uint32)
+    counts[5, 5, 2], counts[5, 6, 2] = 120, 3
+    assert len(kept(counts, lattice, from_xyz_rpy((0, 0, 0), (0, 0, 0)))) == 1
+
+
+def test_large_voxels_never_ask_for_more_than_a_hand() -> None:
+    lattice = Lattice((-0.5, -0.5, 1.0), 0.1, (10, 10, 10))
+    counts = np.zeros(lattice.shape, np.uint32)
+    full = FX * FY * (0.1 / 1.55) ** 2
+    counts[5, 5, 5] = math.ceil(0.25 * full)
+    pose = from_xyz_rpy((0, 0, 0), (0, 0, 0))
+    assert len(kept(counts, lattice, pose, threshold=0.95)) == 1
+    assert len(kept(counts, lattice, pose, threshold=0.95, area_max_m2=0.01)) == 0
+
+
+def test_expected_counts() -> None:
+    # A pinhole camera of f = 424 px sees a square of 5 cm at 1 m as 21.2 px.
+    assert expected_pinhole(0.05, 1.0, 424.0, 424.0) == pytest.approx(21.2**2)
+    # The paper: 640x480 and 75 x 62 degrees, 5 cm at 1 m are 2.8624 degrees, 24.4 columns by 22.2 rows.
+    assert expected_angular(0.05, 1.0, 75.0 / 640.0, 62.0 / 480.0) == pytest.approx(541.0, rel=2e-3)
+    assert math.isfinite(expected_pinhole(0.05, 0.0, 424.0, 424.0))
+    assert math.isfinite(expected_angular(0.05, 0.0, 0.1, 0.1))

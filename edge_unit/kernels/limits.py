@@ -22,6 +22,16 @@ ZERO, ONE, TOP = np.float32(0.0), np.float32(1.0), np.float32(RAW_MAX)
 
 
 @kernel
+def less_noise(z_m: float, noise_m: float) -> float:
+    """Depth `z_m` less a noise that was reckoned there, taken off where it is symmetric: in disparity, that is in 1/z.
+
+    For small noise it is `z - noise`. Far away that would fall below 0, for noise grows with the square of depth,
+    and a wall at the end of the hall would hide who stands before the camera.
+    """
+    return z_m * z_m / (z_m + noise_m)
+
+
+@kernel
 def static_limit_raw(
     cad_w: NDArray[np.float32],
     reference_m: NDArray[np.float32],
@@ -36,8 +46,8 @@ def static_limit_raw(
 ) -> None:
     """Per pixel, the raw depth at which what is measured is no longer nearer than all that stands still.
 
-    The nearer of the CAD surface, `z - (base + noise * z**2)` with `cad_w` = 1/z (H, W), and the learned surface,
-    `z - (base + gain * spread)` with `reference_m`, `spread_m` (H, W), NaN where nothing was learned;
+    The nearer of the CAD surface, less `base + noise * z**2` with `cad_w` = 1/z (H, W), and the learned surface,
+    less `base + gain * spread` with `reference_m`, `spread_m` (H, W), NaN where nothing was learned;
     `range_max_m` where neither is known. Out: `limit_raw` (H, W), rounded down.
     """
     height, width = limit_raw.shape
@@ -47,10 +57,10 @@ def static_limit_raw(
             w = cad_w[y, x]
             if w > 0.0:
                 z = 1.0 / w
-                limit_m = min(limit_m, z - (cad_base_m + cad_noise_per_m * z * z))
+                limit_m = min(limit_m, less_noise(z, cad_noise_per_m * z * z) - cad_base_m)
             learned = reference_m[y, x]
             if learned == learned:
-                limit_m = min(limit_m, learned - (reference_base_m + reference_gain * spread_m[y, x]))
+                limit_m = min(limit_m, less_noise(learned, reference_gain * spread_m[y, x]) - reference_base_m)
             limit_raw[y, x] = np.uint16(min(max(math.floor(limit_m / depth_scale_m), 0), RAW_MAX))
 
 

@@ -219,8 +219,10 @@ def test_rectangles_hold_what_was_drawn_and_clear_it(seed: int) -> None:
         screen = Screen().draw([ball], [from_xyz_rpy(position, (0, 0, 0))])
         top, bottom, left, right = screen.rectangles[0]
         rows, columns = np.nonzero(screen.drawn)
-        assert (0 <= top <= rows.min()) and (rows.max() <= bottom < screen.height)
-        assert (0 <= left <= columns.min()) and (columns.max() <= right < screen.width)
+        assert (0 <= top <= rows.min())
+        assert (rows.max() <= bottom < screen.height)
+        assert (0 <= left <= columns.min())
+        assert (columns.max() <= right < screen.width)
         assert (bottom - top) <= np.ptp(rows) + 2
         assert (right - left) <= np.ptp(columns) + 2
         clear_rectangles(screen.nearest_w, screen.farthest_w, screen.rectangles)

@@ -8,6 +8,7 @@ In the order of the flow:
     sources/        where frames come from
     inflation       how a mesh grows by a padding
     expected_depth  what the camera should see: static layer and robot layer (Algorithms 2 to 5)
+    halo            what edges of the CAD make the camera see beside them
     reference       the static layer that is learned from the empty cell
     voxels          foreground pixels become voxels of the lattice (Algorithms 1, 6 and 7)
     visibility      which blocks of the cell a frame looks through

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edge_unit.expected_depth import BareRobot, RobotLayer, StaticLayer
+from edge_unit.halo import EdgeHalo
 from edge_unit.health import Health, HealthCheck
 from edge_unit.kernels import foreground, limits
 from edge_unit.reference import Reference, ReferenceLearner
@@ -78,10 +79,12 @@ class DepthPipeline:
         stride = -(-intrinsics.width // MASK_ALIGNMENT) * MASK_ALIGNMENT
         self._mask = np.zeros((intrinsics.height, stride), np.uint8)
         self._limit_raw = np.empty(intrinsics.shape, np.uint16)
+        self._seen_limit_raw = np.empty(intrinsics.shape, np.uint16)
         self._room_raw = np.empty(intrinsics.shape, np.uint16)
         self._scratch_raw = np.empty((2, *intrinsics.shape), np.uint16)
         self._unlearned = np.full(intrinsics.shape, np.nan, np.float32)
         self._depth_raw = np.zeros(intrinsics.shape, np.uint16)
+        self._halo = EdgeHalo(intrinsics)
         self._health = HealthCheck(intrinsics)
         self.use_cell(cell)
 
@@ -141,7 +144,7 @@ class DepthPipeline:
     def seen(self) -> SeenBlocks:
         """The blocks of the cell that the last frame looked through."""
         return self._visibility.look(
-            self._depth_raw, self._limit_raw, self._robot.near_raw, self.settings.seen_share_min
+            self._depth_raw, self._seen_limit_raw, self._robot.near_raw, self.settings.seen_share_min
         )
 
     def health(self) -> Health:
@@ -283,6 +286,7 @@ class DepthPipeline:
             self._minimum_raw,
             self._mask,
         )
+        self._halo.drop(depth_raw, self._mask)
 
     def _draw_cad(self) -> None:
         placed = (*self.cell.static, *self.cell.objects)
@@ -294,13 +298,14 @@ class DepthPipeline:
         learned = self.reference
         reference_m = learned.depth_m if learned else self._unlearned
         spread_m = learned.spread_m if learned else self._unlearned
+        cad_noise_per_m = settings.margin_noise_gain * self._noise_per_m
         raw, scratch = self._scratch_raw
         limits.static_limit_raw(
             self._cad.nearest_w,
             reference_m,
             spread_m,
             settings.margin_base_m,
-            settings.margin_noise_gain * self._noise_per_m,
+            cad_noise_per_m,
             settings.reference_margin_base_m,
             settings.reference_spread_gain,
             settings.range_max_m,
@@ -312,6 +317,8 @@ class DepthPipeline:
         self._minimum_raw = max(int(np.ceil(settings.range_min_m / camera.depth_scale_m)), 1)
         np.subtract(np.maximum(self._limit_raw, self._minimum_raw), self._minimum_raw, out=self._room_raw)
         w = self._cad.nearest_w
+        self._halo.renew(w, settings.static_padding_m, settings.margin_base_m, cad_noise_per_m)
+        self._halo.lower(self._limit_raw, self._seen_limit_raw)
         cad_m = np.full(camera.shape, np.inf, np.float32)
         np.divide(1.0, w, out=cad_m, where=w > 0.0)
         self._static_depth_m = np.fmin(cad_m, reference_m)

@@ -64,6 +64,12 @@ class FilterSettings(BaseModel):
         le=15,
         description="Static limits take the nearest over this radius (pixels at 1280 wide, scaled to the camera).",
     )
+    static_padding_m: float = Field(
+        default=0.05,
+        ge=0.0,
+        le=0.3,
+        description="How far beside the edges of CAD surfaces their own depth may be measured, in metres.",
+    )
     robot_padding_m: float = Field(
         default=0.05, ge=0.0, le=0.3, description="How far the robot's links are inflated, in metres."
     )

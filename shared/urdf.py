@@ -242,8 +242,6 @@ def _mesh_file(file: Path, link: str, uri: str | None, packages: Mapping[str, Pa
     if package in packages:
         return Path(packages[package]) / rest
     for folder in file.absolute().parents:
-        if folder.name == package and (folder / rest).is_file():
-            return folder / rest
         if (folder / package / rest).is_file():
             return folder / package / rest
     installed = importlib.util.find_spec(package) if package.isidentifier() else None

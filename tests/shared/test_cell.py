@@ -252,6 +252,41 @@ def test_dh_robot_with_prismatic_joint_and_tool(tmp_path: Path) -> None:
     np.testing.assert_allclose(robot.links[2].mesh.bounds_m[1][2], 0.1, atol=1e-7)
 
 
+def test_urdf_robot_with_every_key(tmp_path: Path) -> None:
+    (tmp_path / "ros" / "my_arm" / "meshes").mkdir(parents=True)
+    trimesh.creation.box(extents=(0.2, 0.2, 0.2)).export(tmp_path / "ros" / "my_arm" / "meshes" / "b.stl")
+    shapes = (
+        "<collision><geometry><mesh filename='package://arm_description/meshes/b.stl'/></geometry></collision>"
+        "<visual><geometry><mesh filename='package://arm_description/meshes/b.stl' scale='2 2 2'/></geometry></visual>"
+    )
+    slide = (
+        '<link name="c"><visual><geometry><sphere radius="0.1"/></geometry></visual></link>'
+        '<joint name="slide" type="prismatic"><parent link="b"/><child link="c"/><axis xyz="0 0 1"/></joint>'
+        '<link name="d"/><joint name="wrist" type="continuous"><parent link="c"/><child link="d"/></joint>'
+    )
+    (tmp_path / "r.urdf").write_text(URDF.format(shapes, TURN + slide))
+    text = (
+        "robot:\n"
+        "  urdf: r.urdf\n"
+        "  meshes: {}\n"
+        "  joints: [wrist, j]\n"
+        "  held_joints: {{slide: 0.3}}\n"
+        "  packages: {{arm_description: ros/my_arm}}\n"
+        "  tool: {{box: [0.1, 0.1, 0.1], pose: {{xyz: [0, 0, 0.05]}}}}\n"
+    )
+    visual = Cell.load(written(tmp_path, text.format("visual"))).robot
+    collision = Cell.load(written(tmp_path, text.format("collision"))).robot
+    assert visual is not None
+    assert collision is not None
+    assert visual.joint_names == ("wrist", "j")
+    assert [link.name for link in visual.links] == ["b", "c", "tool"]
+    assert [link.name for link in collision.links] == ["b", "tool"]
+    np.testing.assert_allclose(visual.links[0].mesh.bounds_m[1], 0.2, atol=1e-7)
+    np.testing.assert_allclose(collision.links[0].mesh.bounds_m[1], 0.1, atol=1e-7)
+    np.testing.assert_allclose(visual.link_poses([0.0, 0.0])[1:, 2, 3], 0.3, atol=1e-12)
+    np.testing.assert_allclose(visual.links[2].mesh.bounds_m[1][2], 0.1, atol=1e-7)
+
+
 URDF = '<robot name="r"><link name="a"/><link name="b">{}</link>{}</robot>'
 TURN = '<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint>'
 SHAPE = "<collision><geometry><box size='1 1 1'/></geometry></collision>"

@@ -245,6 +245,16 @@ def test_tool_hangs_on_the_last_link_or_where_it_is_told(tmp_path: Path) -> None
     np.testing.assert_array_equal(serial.link_poses(np.ones(6))[0], serial.frame_pose("tool0", np.ones(6)))
 
 
+def test_longest_chain_counts_moving_joints_only(tmp_path: Path) -> None:
+    joints = (("continuous", "a", "hand"), ("fixed", "a", "b"), ("fixed", "b", "c"), ("fixed", "c", "camera"))
+    text = "".join(f'<link name="{link}"/>' for link in ("a", "b", "c", "hand", "camera"))
+    for kind, parent, child in joints:
+        text += f'<joint name="{child}" type="{kind}"><parent link="{parent}"/><child link="{child}"/></joint>'
+    robot = Robot.from_urdf(urdf_file(tmp_path, f'<robot name="r">{text}</robot>'), tool=box_mesh("t", (1, 1, 1)))
+    np.testing.assert_allclose(robot.link_poses([0.5])[0], robot.frame_pose("hand", [0.5]))
+    assert robot.links[0].moving
+
+
 def test_ur3e_links() -> None:
     robot = Robot.from_urdf(airo_ur3e())
     assert [link.name for link in robot.links] == [

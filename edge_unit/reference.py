@@ -109,6 +109,7 @@ class ReferenceLearner:
         self._intrinsics = intrinsics
         self._noise_per_m = noise_per_m
         self._range_max_m = range_max_m
+        self._looks = np.zeros(intrinsics.shape, np.uint16)
         self._numbers = np.zeros(shape, np.uint16)
         self._means_m = np.zeros(shape, np.float32)
         self._squares_m2 = np.zeros(shape, np.float32)
@@ -135,6 +136,7 @@ class ReferenceLearner:
             self._range_max_m,
             MATCH_BASE_M,
             MATCH_SIGMAS * self._noise_per_m,
+            self._looks,
             self._numbers,
             self._means_m,
             self._squares_m2,
@@ -152,6 +154,7 @@ class ReferenceLearner:
         depth_m = np.empty(self._intrinsics.shape, np.float32)
         spread_m = np.empty(self._intrinsics.shape, np.float32)
         kernels.conclude(
+            self._looks,
             self._numbers,
             self._means_m,
             self._squares_m2,

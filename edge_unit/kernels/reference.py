@@ -2,7 +2,9 @@
 """Surfaces that the empty cell shows, learned pixel by pixel.
 
 Each pixel keeps a few *modes*: depths that came again and again, with their mean and spread. A flickering edge has
-two; a person who walks past makes one that stays rare. What counts in the end is the nearest mode that is not rare.
+two; a person who walks past makes one that stays rare. What counts in the end is the nearest mode that is not rare
+among all the looks that the pixel had, measured or not: where the empty cell shows nothing, who walks past is the
+only one that is ever measured, and still rare.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.kernels.jit import kernel
+from edge_unit.kernels.limits import RAW_MAX
 
 MODES = 4
 """A pixel at an edge shows two surfaces and the flying depths between; one more for who walks past."""
@@ -27,24 +30,28 @@ def observe(
     range_max_m: float,
     match_base_m: float,
     match_noise_per_m: float,
+    looks: NDArray[np.uint16],
     numbers: NDArray[np.uint16],
     means_m: NDArray[np.float32],
     squares_m2: NDArray[np.float32],
 ) -> None:
     """Add one frame to the modes of every pixel (Welford's running mean and sum of squares).
 
-    Depths that are absent, beyond the range, or inside the robot's band are no news. A depth joins the mode within
-    `base + noise * z**2` of it; otherwise it starts one, in the place of the rarest when all are taken.
-    `numbers`, `means_m`, `squares_m2` are (H, W, MODES).
+    What lies inside the robot's band, or is unmeasured where the robot stands, is no look at what is behind it.
+    Depths that are absent or beyond the range are a look that showed nothing. Any other depth joins the mode within
+    `base + noise * z**2` of it, or starts one, in the place of the rarest when all are taken.
+    `looks` is (H, W); `numbers`, `means_m`, `squares_m2` are (H, W, MODES).
     """
     height, width = depth_raw.shape
     for y in range(height):
         for x in range(width):
             raw = depth_raw[y, x]
-            if raw == 0 or np.uint16(raw - robot_near_raw[y, x]) <= robot_span_raw[y, x]:
+            near = robot_near_raw[y, x]
+            if near < RAW_MAX and (raw == 0 or np.uint16(raw - near) <= robot_span_raw[y, x]):
                 continue
+            looks[y, x] += 1
             z = np.float32(raw * depth_scale_m)
-            if z > range_max_m:
+            if raw == 0 or z > range_max_m:
                 continue
             reach = match_base_m + match_noise_per_m * z * z
             rarest = 0
@@ -69,6 +76,7 @@ def observe(
 
 @kernel
 def conclude(
+    looks: NDArray[np.uint16],
     numbers: NDArray[np.uint16],
     means_m: NDArray[np.float32],
     squares_m2: NDArray[np.float32],
@@ -78,7 +86,7 @@ def conclude(
     reference_m: NDArray[np.float32],
     spread_m: NDArray[np.float32],
 ) -> None:
-    """The nearest mode that holds at least `share_min` of what a pixel showed, and its standard deviation.
+    """The nearest mode that holds at least `share_min` of a pixel's looks, and its standard deviation.
 
     The spread is drawn towards the camera's model `noise * z**2` as if `prior_weight` frames had shown it, for the
     spread of few frames is no measure. `reference_m`, `spread_m` (H, W) are NaN where nothing was learned.
@@ -86,12 +94,9 @@ def conclude(
     height, width = reference_m.shape
     for y in range(height):
         for x in range(width):
-            total = 0
-            for k in range(MODES):
-                total += numbers[y, x, k]
             best = -1
             for k in range(MODES):
-                credible = numbers[y, x, k] > 0 and numbers[y, x, k] >= share_min * total
+                credible = numbers[y, x, k] > 0 and numbers[y, x, k] >= share_min * looks[y, x]
                 if credible and (best < 0 or means_m[y, x, k] < means_m[y, x, best]):
                     best = k
             if best < 0:

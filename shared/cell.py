@@ -18,7 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from shared.cell_file import MAX_BODIES, BoardFile, DHFile, RobotFile, ShapeFile, named_file, read_cell_file
 from shared.configuration import sentence
 from shared.errors import CellError, InputError, KinematicsError, MeshError
-from shared.kinematics import DHJoint, Robot
+from shared.joint_table import DHJoint
+from shared.kinematics import Robot
 from shared.lattice import Lattice
 from shared.meshes import TriangleMesh, box_mesh, cylinder_mesh, load_mesh, mesh_by_hash
 from shared.transforms import Transform, validated

@@ -18,7 +18,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from shared.errors import CellError
-from shared.kinematics import MAX_JOINTS
+from shared.joint_table import MAX_JOINTS
 from shared.meshes import MAX_COORDINATE_M
 from shared.transforms import Transform, from_xyz_rpy
 

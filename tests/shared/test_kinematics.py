@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from shared.clock import NS_PER_MS, stage_ns
 from shared.errors import InputError, KinematicsError, MeshError
-from shared.kinematics import BASE, Attachment, DHJoint, Motion, Robot
+from shared.joint_table import BASE, Attachment, DHJoint, Motion
+from shared.kinematics import Robot
 from shared.meshes import TriangleMesh, box_mesh
 from shared.transforms import apply, from_xyz_rpy, identity, inverse
 

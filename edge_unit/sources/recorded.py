@@ -143,6 +143,15 @@ def read_pose(path: Path) -> Transform:
         raise ConfigError(f"{path}: {error}") from error
 
 
+def open_recording(config: RecordedSourceConfig) -> CameraInfo:
+    """The camera of a recording, without its frames.
+
+    Raises:
+        SourceError: something is missing or malformed; names the file.
+    """
+    return _open(config).info
+
+
 def _open(config: RecordedSourceConfig) -> _Recording:
     folder = config.folder
     if not folder.is_dir():

@@ -123,7 +123,8 @@ def table_of_urdf(
         parent = tool_parent or _last_link(path, model)
         if parent not in frames:
             raise KinematicsError(f"{path}: expected a link to hold the tool, got {parent}")
-        attachments.append(Attachment("tool", *frames[parent], tool))
+        name = "tool" if "tool" not in frames else "mounted_tool"
+        attachments.append(Attachment(name, *frames[parent], tool))
     return names, motions, attachments
 
 

@@ -246,6 +246,13 @@ def test_tool_hangs_on_the_last_link_or_where_it_is_told(tmp_path: Path) -> None
     np.testing.assert_array_equal(serial.link_poses(np.ones(6))[0], serial.frame_pose("tool0", np.ones(6)))
 
 
+def test_tool_may_hang_on_a_link_named_tool(tmp_path: Path) -> None:
+    text = ur3_urdf().replace("tool0", "tool")
+    robot = Robot.from_urdf(urdf_file(tmp_path, text), tool=box_mesh("t", (1, 1, 1)), tool_parent="tool")
+    assert [link.name for link in robot.links] == ["mounted_tool"]
+    np.testing.assert_array_equal(robot.link_poses(np.ones(6))[0], robot.frame_pose("tool", np.ones(6)))
+
+
 def test_longest_chain_counts_moving_joints_only(tmp_path: Path) -> None:
     joints = (("continuous", "a", "hand"), ("fixed", "a", "b"), ("fixed", "b", "c"), ("fixed", "c", "camera"))
     text = "".join(f'<link name="{link}"/>' for link in ("a", "b", "c", "hand", "camera"))

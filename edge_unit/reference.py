@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import io
+import tokenize
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +32,22 @@ PRIOR_FRAMES = 4.0
 MAX_FRAMES = 65535
 """Samples of a pixel are counted in uint16."""
 
+DAMAGED = (
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    EOFError,
+    OSError,
+    RuntimeError,
+    MemoryError,
+    SyntaxError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What numpy and zipfile raise over damaged bytes; a fuzz test knows no other."""
+
 FILE_BYTES_MAX = 64 * 1024 * 1024
 """Two float32 images of the largest camera, uncompressed, and a header: a larger file is not ours."""
 
@@ -50,6 +68,13 @@ class Reference:
             raise InputError(
                 f"reference: expected two images of one shape, got {self.depth_m.shape} and {self.spread_m.shape}"
             )
+        if self.depth_m.dtype != np.float32 or self.spread_m.dtype != np.float32:
+            raise InputError(f"reference: expected float32, got {self.depth_m.dtype} and {self.spread_m.dtype}")
+        if self.frames < 1:
+            raise InputError(f"reference: expected at least one frame, got {self.frames}")
+        sound = (self.depth_m > 0.0) & np.isfinite(self.depth_m) & (self.spread_m >= 0.0) & np.isfinite(self.spread_m)
+        if not (sound | np.isnan(self.depth_m)).all():
+            raise InputError("reference: expected depths above 0 with a spread of at least 0, or NaN, got others")
 
     @property
     def learned_share(self) -> float:
@@ -71,13 +96,10 @@ class Reference:
         """
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-                return cls(
-                    np.ascontiguousarray(stored["depth_m"], np.float32),
-                    np.ascontiguousarray(stored["spread_m"], np.float32),
-                    int(stored["frames"]),
-                )
-        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"reference: expected an npz with depth_m, spread_m, frames, got {error}") from error
+                depth_m, spread_m, frames = stored["depth_m"], stored["spread_m"], int(stored["frames"])
+        except DAMAGED as error:
+            raise InputError(f"reference: expected an npz with depth_m, spread_m and frames, got {error}") from error
+        return cls(np.ascontiguousarray(depth_m), np.ascontiguousarray(spread_m), frames)
 
     def save(self, path: Path) -> None:
         """Write to `path`, whole or not at all."""
@@ -94,10 +116,12 @@ class Reference:
         """
         try:
             if path.stat().st_size > FILE_BYTES_MAX:
-                raise InputError(f"reference {path}: expected at most {FILE_BYTES_MAX} bytes")
+                raise InputError(f"expected at most {FILE_BYTES_MAX} bytes")
             return cls.from_bytes(path.read_bytes())
         except OSError as error:
-            raise InputError(f"reference {path}: {error.strerror}") from error
+            raise InputError(f"{path}: {error.strerror}") from error
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
 
 
 class ReferenceLearner:

@@ -18,8 +18,8 @@ NOTHING_NEAREST = np.float32(0.0)
 """`nearest_w` of a pixel without a surface: infinitely far."""
 
 NOTHING_FARTHEST = np.float32(1e6)
-"""`farthest_w` of a pixel without a surface: a micrometre away, so that any surface is farther. Not the largest float32:
-its inverse is subnormal, which costs a hundred cycles a pixel."""
+"""`farthest_w` of a pixel without a surface: a micrometre away, so that any surface is farther. Not the largest
+float32: its inverse is subnormal, which costs a hundred cycles a pixel."""
 
 
 @kernel

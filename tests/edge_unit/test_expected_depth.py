@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike, NDArray
+
+from edge_unit.expected_depth import STILL_M, BareRobot, MeshBatch, RobotLayer, StaticLayer
+from edge_unit.inflation import vertex_offsets
+from edge_unit.kernels.limits import RAW_MAX
+from edge_unit.pipeline import DepthPipeline
+from shared.cell import Cell, PlacedMesh
+from shared.kinematics import Robot
+from shared.meshes import TriangleMesh, box_mesh, sphere_mesh
+from shared.transforms import Transform, from_xyz_rpy, inverse, look_at
+from tests.edge_unit.scenes import (
+    ABOVE_TABLE,
+    HOME_RAD,
+    OVERHEAD,
+    bodies,
+    camera,
+    demo_cell,
+    grown,
+    placed,
+    raycast,
+    small_robot,
+)
+
+NOISE_PER_M, DEPTH_M = 0.02, 0.15
+
+# ---------------------------------------------------------------- against an independent ray caster
+
+VIEWS: list[tuple[Transform, ArrayLike]] = [
+    (ABOVE_TABLE, HOME_RAD),
+    (look_at((-0.9, -1.1, 1.4), (0.2, 0.0, 0.2)), (1.2, -0.6, 0.9, -2.0, 1.2, 2.0)),
+    (look_at((0.35, 0.0, 1.2), (0.3, 0.05, 0.0)), (-0.8, -2.0, -1.2, 0.4, 0.9, -1.0)),
+    (look_at((0.45, -0.45, 0.35), (0.1, 0.0, 0.25)), np.zeros(6)),
+]
+
+
+@pytest.mark.parametrize("view", range(len(VIEWS)))
+def test_expected_depth_is_what_rays_hit(view: int) -> None:
+    """UR3e, gripper, table, shelf, tray and floor at 1280 x 720."""
+    T_world_camera, joints = VIEWS[view]
+    intrinsics, cell = camera(1280, 720), demo_cell()
+    expected_m = DepthPipeline(intrinsics, T_world_camera, cell).expected_depth(joints)
+    cast_m = raycast(bodies(cell, joints), T_world_camera, intrinsics)
+    assert expected_m.dtype == np.float32
+    drawn, hit = np.isfinite(expected_m), np.isfinite(cast_m)
+    both = drawn & hit
+    assert both.mean() > 0.3
+    agree = np.abs(expected_m[both] - cast_m[both]) <= 0.001
+    print(f"view {view}: {100 * agree.mean():.4f} % within 1 mm, {(drawn ^ hit).sum()} pixels hit by one only")
+    assert agree.mean() >= 0.999
+    assert not (drawn & ~grown(hit)).any()
+    assert not (hit & ~grown(drawn)).any()
+
+
+@pytest.mark.parametrize("view", range(len(VIEWS)))
+def test_the_robots_silhouette_is_that_of_rays(view: int) -> None:
+    T_world_camera, joints = VIEWS[view]
+    intrinsics, robot = camera(1280, 720), demo_cell().robot
+    cell = Cell("robot alone", np.full(3, -1.0), np.full(3, 1.0), robot=robot)
+    expected_m = DepthPipeline(intrinsics, T_world_camera, cell).expected_depth(joints)
+    cast_m = raycast(bodies(cell, joints), T_world_camera, intrinsics)
+    drawn, hit = np.isfinite(expected_m), np.isfinite(cast_m)
+    assert hit.sum() > 5000
+    both = drawn & hit
+    agree = np.abs(expected_m[both] - cast_m[both]) <= 0.001
+    print(f"view {view}: {100 * agree.mean():.4f} % within 1 mm, {(drawn ^ hit).sum()} of {hit.sum()} by one only")
+    assert agree.mean() >= 0.999
+    assert (drawn ^ hit).sum() <= 0.001 * hit.sum() + 5
+    assert not (drawn & ~grown(hit)).any()
+    assert not (hit & ~grown(drawn)).any()
+
+
+def test_a_link_that_the_near_plane_cuts_does_not_vanish() -> None:
+    """The arm passes right before the lens: one end lies behind the camera, the other fills the picture's middle."""
+    intrinsics = camera(424, 240)
+    bar = box_mesh("bar", (1.0, 0.05, 0.05))
+    T_world_camera = look_at((0.0, 0.09, 0.0), (0.4, -0.05, 0.0))
+    cell = Cell("bar", np.full(3, -1.0), np.full(3, 1.0), static=(placed("bar", bar),))
+    expected_m = DepthPipeline(intrinsics, T_world_camera, cell).expected_depth(None)
+    cast_m = raycast(cell.static, T_world_camera, intrinsics)
+    beyond = np.isfinite(cast_m) & (cast_m > 0.06)
+    assert beyond.mean() > 0.1
+    assert (np.abs(expected_m[beyond] - cast_m[beyond]) <= 0.001).mean() >= 0.999
+
+
+# ---------------------------------------------------------------- meshes as flat arrays
+
+
+def test_a_batch_without_meshes_draws_nothing() -> None:
+    batch, intrinsics = MeshBatch([], inflate=True), camera(64, 40)
+    nearest_w, farthest_w = np.zeros(intrinsics.shape, np.float32), np.full(intrinsics.shape, 9, np.float32)
+    batch.draw(intrinsics, np.zeros((0, 4, 4)), np.zeros(0, np.float32), nearest_w, farthest_w)
+    assert not nearest_w.any()
+    assert (farthest_w == 9).all()
+
+
+def test_meshes_of_a_batch_keep_to_themselves() -> None:
+    """Each alone gives the picture that all together give."""
+    intrinsics = camera(160, 90)
+    meshes = [sphere_mesh("ball", 0.2), box_mesh("box", (0.2, 0.3, 0.1)), sphere_mesh("small", 0.05)]
+    poses = [from_xyz_rpy((x, 0.1 * x, 1.5 + x), (x, 0.2, 0.0)) for x in (-0.5, 0.1, 0.4)]
+    together = StaticLayer(intrinsics, meshes)
+    together.draw(np.eye(4), poses)
+    alone = np.zeros(intrinsics.shape, np.float32)
+    for mesh, pose in zip(meshes, poses, strict=True):
+        layer = StaticLayer(intrinsics, [mesh])
+        layer.draw(np.eye(4), [pose])
+        alone = np.maximum(alone, layer.nearest_w)
+    assert (together.nearest_w == alone).all()
+
+
+def test_the_static_layer_is_drawn_anew_each_time() -> None:
+    layer = StaticLayer(camera(160, 90), [sphere_mesh("ball", 0.2)])
+    layer.draw(np.eye(4), [from_xyz_rpy((0, 0, 1), (0, 0, 0))])
+    first = layer.nearest_w.copy()
+    layer.draw(np.eye(4), [from_xyz_rpy((0.3, 0, 2), (0, 0, 0))])
+    assert (layer.nearest_w != first).any()
+    layer.draw(look_at((0, 0, 0), (0, 0, -1)), [from_xyz_rpy((0, 0, 1), (0, 0, 0))])
+    assert not layer.nearest_w.any()
+
+
+def test_the_bare_robot_forgets_where_it_was() -> None:
+    robot, intrinsics = small_robot(), camera(160, 90)
+    layer = BareRobot(intrinsics, robot)
+
+    def draw(angle_rad: float) -> NDArray[np.float32]:
+        return layer.nearest_w(inverse(OVERHEAD) @ robot.link_poses([angle_rad])).copy()
+
+    first = draw(0.0)
+    assert (draw(1.5) != first).any()
+    assert (draw(0.0) == first).all()
+
+
+# ---------------------------------------------------------------- the padded robot
+
+
+class Arm:
+    """The small robot before its camera."""
+
+    def __init__(self, robot: Robot | None = None) -> None:
+        self.intrinsics = camera(424, 240)
+        self.robot = robot or small_robot()
+        self.layer = RobotLayer(self.intrinsics, self.robot)
+
+    def poses(self, *joints: float) -> NDArray[np.float64]:
+        return inverse(OVERHEAD) @ self.robot.T_world_base @ self.robot.link_poses(joints)
+
+    def draw(self, angle_rad: float, padding_m: ArrayLike = 0.05, hidden: list[bool] | None = None) -> bool:
+        padding = np.broadcast_to(np.asarray(padding_m, np.float32), (len(self.robot.links),))
+        mask = None if hidden is None else np.array(hidden)
+        return self.layer.draw(self.poses(angle_rad), np.ascontiguousarray(padding), NOISE_PER_M, DEPTH_M, mask)
+
+    @property
+    def there(self) -> NDArray[np.bool_]:
+        return np.asarray(self.layer.near_raw < RAW_MAX)
+
+    def bare_m(self, angle_rad: float) -> NDArray[np.float64]:
+        cell = Cell("arm", np.full(3, -1.0), np.full(3, 1.0), robot=self.robot)
+        return raycast(bodies(cell, [angle_rad]), OVERHEAD, self.intrinsics)
+
+
+def test_the_band_is_that_of_rays_on_the_inflated_links() -> None:
+    arm = Arm()
+    assert arm.draw(0.4)
+    each_m = []
+    for link, pose in zip(arm.robot.links, arm.robot.link_poses([0.4]), strict=True):
+        vertices = link.mesh.vertices + np.float32(0.05) * vertex_offsets(link.mesh)
+        inflated = TriangleMesh(link.name, vertices, link.mesh.faces, link.mesh.closed)
+        each_m.append(raycast([PlacedMesh(link.name, inflated, pose)], OVERHEAD, arm.intrinsics))
+    near_m = np.min(each_m, axis=0)
+    hit = np.isfinite(near_m)
+    far_m = np.max([np.where(np.isfinite(z), z, 0.0) for z in each_m], axis=0)[hit]
+    near_m = near_m[hit]
+    assert (arm.there == hit).mean() > 0.9999
+    low_m = arm.layer.near_raw[hit] / 1000
+    high_m = low_m + arm.layer.span_raw[hit] / 1000
+    assert (np.abs(low_m - (near_m - NOISE_PER_M * near_m**2)) <= 0.002).mean() > 0.995
+    assert (np.abs(high_m - (far_m + NOISE_PER_M * far_m**2 + DEPTH_M)) <= 0.003).mean() > 0.995
+
+
+def test_the_padding_surrounds_the_robot() -> None:
+    """50 mm at some 1.4 m are 7 px here."""
+    arm = Arm()
+    arm.draw(0.4)
+    hit = np.isfinite(arm.bare_m(0.4))
+    assert arm.there[grown(hit, 4)].all()
+    assert not (arm.there & ~grown(hit, 20)).any()
+
+
+def test_rows_enclose_the_robot() -> None:
+    arm = Arm()
+    arm.draw(0.4)
+    first_row, last_row, first_column, last_column = arm.layer.rows
+    rows, columns = np.nonzero(arm.there)
+    assert first_row <= rows.min() <= rows.max() <= last_row
+    assert first_column <= columns.min() <= columns.max() <= last_column
+
+
+def test_the_same_joints_are_not_drawn_again() -> None:
+    arm = Arm()
+    assert arm.draw(0.4)
+    near_raw = arm.layer.near_raw.copy()
+    assert not arm.draw(0.4)
+    assert (arm.layer.near_raw == near_raw).all()
+    assert arm.draw(0.5)
+    assert (arm.layer.near_raw != near_raw).any()
+
+
+def test_after_any_way_the_band_is_that_of_a_fresh_layer() -> None:
+    arm = Arm()
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        arm.draw(rng.uniform(-3, 3), rng.choice([0.02, 0.05, 0.1]), [bool(rng.random() < 0.3), False])
+    arm.layer.forget()
+    assert not arm.there.any()
+    assert not arm.layer.span_raw.any()
+    arm.draw(0.4)
+    fresh = Arm()
+    fresh.draw(0.4)
+    assert (arm.layer.near_raw == fresh.layer.near_raw).all()
+    assert (arm.layer.span_raw == fresh.layer.span_raw).all()
+    assert (arm.layer.rows == fresh.layer.rows).all()
+
+
+def test_trembling_joints_are_not_drawn_again() -> None:
+    arm = Arm()
+    rng = np.random.default_rng(0)
+    arm.draw(0.4)
+    assert not any(arm.draw(0.4 + angle) for angle in rng.uniform(-2e-4, 2e-4, 100))
+
+
+def test_a_slow_drift_is_never_far_from_what_is_drawn() -> None:
+    """Steps of a twentieth of STILL_M at the tip: each is small, and all together are not."""
+    arm, tip_m = Arm(), 0.4
+    arm.draw(0.0)
+    drawn_rad, draws = 0.0, 0
+    for angle in np.arange(1, 400) * (STILL_M / 20 / tip_m):
+        if arm.draw(float(angle)):
+            drawn_rad, draws = float(angle), draws + 1
+        assert abs(angle - drawn_rad) * tip_m <= STILL_M
+    assert draws >= 399 // 20
+    fresh = Arm()
+    fresh.draw(drawn_rad)
+    assert (arm.layer.near_raw == fresh.layer.near_raw).all()
+
+
+def test_a_drift_of_the_padding_is_followed_too() -> None:
+    arm = Arm()
+    arm.draw(0.0, 0.05)
+    assert not arm.draw(0.0, 0.0502)
+    assert arm.draw(0.0, 0.06)
+    assert arm.draw(0.0, [0.06, 0.08])
+
+
+def test_hidden_links_are_left_out() -> None:
+    arm = Arm()
+    arm.draw(0.4)
+    whole = arm.there.copy()
+    assert arm.draw(0.4, hidden=[True, False])
+    moving = arm.there.copy()
+    assert arm.draw(0.4, hidden=[False, True])
+    fixed = arm.there.copy()
+    assert ((moving | fixed) == whole).all()
+    assert (moving & ~fixed).sum() > 100
+    assert (fixed & ~moving).sum() > 100
+    assert arm.draw(0.4, hidden=[True, True])
+    assert not arm.there.any()
+    assert arm.draw(0.4, hidden=[False, False])
+    assert (arm.there == whole).all()
+
+
+def test_without_a_robot_nothing_is_drawn() -> None:
+    layer = RobotLayer(camera(64, 40), None)
+    assert (layer.near_raw == RAW_MAX).all()
+    layer.forget()
+    assert not layer.span_raw.any()

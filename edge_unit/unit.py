@@ -142,6 +142,10 @@ class Unit:
         self.uplink.set_camera(camera, self._pose or (None if pose is None else (pose, "source")))
         self.uplink.trouble = None
         await self.uplink.assigned.wait()
+        assignment = self.uplink.assignment
+        if assignment is not None and assignment.T_world_camera is not None:
+            # Before the camera delivers, so that no frame has to wait for what is compiled and drawn only once.
+            await asyncio.to_thread(self._prepared, assignment, assignment.T_world_camera)
 
     async def _take(self, frame: DepthFrame) -> None:
         """Process one frame and offer the result."""
@@ -214,8 +218,7 @@ class Unit:
             pipeline = DepthPipeline(
                 self._camera.intrinsics, T_world_camera, assignment.cell, _filter_settings(assignment)
             )
-            # Compiles what is not in the cache yet, so that the first real frame is not late.
-            pipeline.process(np.zeros(self._camera.intrinsics.shape, np.uint16), None)
+            _warm_up(pipeline)
             self._find_background(pipeline)
         elif assignment is not applied:
             if assignment.cell is not applied.cell:
@@ -309,9 +312,16 @@ def make_source(config: SourceConfig) -> DepthSource:
     return SimulatedSource(config)
 
 
-def _report(
-    pipeline: DepthPipeline, assignment: Assignment, frame: DepthFrame, joints: JointEstimate | None
-) -> Report:
+def _warm_up(pipeline: DepthPipeline) -> None:
+    """Have every kernel compiled, by a frame that shows nothing."""
+    robot = pipeline.cell.robot
+    joints = None if robot is None else np.zeros(robot.joint_count)
+    pipeline.process(np.zeros(pipeline.intrinsics.shape, np.uint16), joints)
+    pipeline.health()
+    pipeline.seen()
+
+
+def _report(pipeline: DepthPipeline, assignment: Assignment, frame: DepthFrame, joints: JointEstimate | None) -> Report:
     if joints is None:
         voxels = pipeline.process(frame.depth, None)
     else:
@@ -352,5 +362,3 @@ def _boot_id() -> str:
         return BOOT_ID.read_text(encoding="ascii").strip()
     except OSError:
         return ""
-
-

@@ -11,7 +11,6 @@ import asyncio
 import logging
 import random
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 from edge_unit.cell_cache import CellCache
@@ -225,8 +224,12 @@ class Uplink:
         """Send the latest report, or, when none comes, the one before again."""
         if self._fresh is None:
             self._wake.clear()
-            with suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._wake.wait(), HEARTBEAT_S)
+            # No wait_for here: until Python 3.12 it swallows a cancellation that comes together with the event.
+            heartbeat = asyncio.get_running_loop().call_later(HEARTBEAT_S, self._wake.set)
+            try:
+                await self._wake.wait()
+            finally:
+                heartbeat.cancel()
         fresh, self._fresh = self._fresh, None
         report = fresh or self._last or Report(assignment)
         if report.assignment.session != assignment.session:

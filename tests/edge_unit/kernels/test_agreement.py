@@ -41,9 +41,7 @@ def test_tallies_are_those_of_the_twin(stride_px: int, shape: tuple[int, int]) -
     static[rng.random(shape) < 0.2] = 0
     depth[rng.random(shape) < 0.2] = 0
     robot = np.where(rng.random(shape) < 0.2, 900, 65535).astype(np.uint16)
-    for found, wanted in zip(
-        run(depth, static, robot, stride_px), twin(depth, static, robot, stride_px), strict=True
-    ):
+    for found, wanted in zip(run(depth, static, robot, stride_px), twin(depth, static, robot, stride_px), strict=True):
         assert (found == wanted).all()
 
 

@@ -144,9 +144,7 @@ class Twin:
 
 def soup(rng: np.random.Generator, count: int, low: float = -0.2, high: float = 2.0) -> TriangleMesh:
     """Triangles in front of the camera, across the near plane and behind it, some of them without an area."""
-    middle = np.stack(
-        (rng.uniform(-1, 1, count), rng.uniform(-1, 1, count), rng.uniform(low, high, count)), axis=-1
-    )
+    middle = np.stack((rng.uniform(-1, 1, count), rng.uniform(-1, 1, count), rng.uniform(low, high, count)), axis=-1)
     corners = middle[:, None, :] + rng.normal(0.0, 0.25, (count, 3, 3))
     corners[::7, 2] = corners[::7, 1]
     corners[3::11, 2] = 2.0 * corners[3::11, 1] - corners[3::11, 0]
@@ -219,10 +217,10 @@ def test_rectangles_hold_what_was_drawn_and_clear_it(seed: int) -> None:
         screen = Screen().draw([ball], [from_xyz_rpy(position, (0, 0, 0))])
         top, bottom, left, right = screen.rectangles[0]
         rows, columns = np.nonzero(screen.drawn)
-        assert (0 <= top <= rows.min())
-        assert (rows.max() <= bottom < screen.height)
-        assert (0 <= left <= columns.min())
-        assert (columns.max() <= right < screen.width)
+        assert 0 <= top <= rows.min()
+        assert rows.max() <= bottom < screen.height
+        assert 0 <= left <= columns.min()
+        assert columns.max() <= right < screen.width
         assert (bottom - top) <= np.ptp(rows) + 2
         assert (right - left) <= np.ptp(columns) + 2
         clear_rectangles(screen.nearest_w, screen.farthest_w, screen.rectangles)

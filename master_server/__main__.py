@@ -110,9 +110,12 @@ async def _serve(config: MasterConfig) -> None:
 def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return socket.create_server((host, port), family=family, backlog=BACKLOG, dualstack_ipv6=host == "::")
+        listener = socket.create_server((host, port), family=family, backlog=BACKLOG, dualstack_ipv6=host == "::")
     except OSError as error:
         raise ConfigError(f"cannot listen at {host} port {port}: {error.strerror or error}") from error
+    # Connections inherit it. Without, the second half of an answer waits 40 ms for the first to be acknowledged.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return listener
 
 
 def _config(options: argparse.Namespace) -> MasterConfig:

@@ -51,10 +51,9 @@ class Visibility:
         box_max_m: NDArray[np.float64],
         block_size_m: float,
     ) -> None:
-        self.lattice = Lattice.covering(box_min_m, box_max_m, block_size_m)
-        while self.lattice.cell_count > MAX_BLOCKS:
+        while np.ceil((box_max_m - box_min_m) / block_size_m).prod() > MAX_BLOCKS:
             block_size_m *= 2.0
-            self.lattice = Lattice.covering(box_min_m, box_max_m, block_size_m)
+        self.lattice = Lattice.covering(box_min_m, box_max_m, block_size_m)
         self._intrinsics = intrinsics
         self._blocks = np.empty(self.lattice.cell_count, np.int32)
         self._views = np.empty((self.lattice.cell_count, 5), np.int32)

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The process that talks to the camera: finds it, streams, and ends when anything goes wrong.
+
+The SDK may hang for good in any call, or take the process down; so it lives here, where it can be killed, and there
+is one way to recover from whatever happens: the next process. Whoever began it reads what it does from the link, and
+it never outlives the link.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import socket
+import sys
+import threading
+from typing import NoReturn
+
+import numpy as np
+import pyrealsense2 as rs
+
+from edge_unit.sources import capture_link as link
+from edge_unit.sources.sdk_camera import Reading, RecordingBroken, SdkCamera, survey
+from edge_unit.sources.shared_frames import SharedFrames
+from shared.clock import NS_PER_MS, monotonic_ns
+from shared.errors import SourceEnded, SourceError
+
+READ_MS = 100
+"""How long one wait for a frame may be; then whoever listens is told that we live."""
+
+ALIVE_EVERY_NS = 100 * NS_PER_MS
+
+LOOK_EVERY_S = 0.5
+"""For a camera that is not there, since the SDK's own notice is sometimes missed."""
+
+FIRST_FRAME_MS = 6_000
+"""From the start of the stream: cameras settle their exposure first, some for seconds."""
+
+SILENCE_MS = 2_000
+"""Without a frame, once they came: the stream is stuck, and waiting was never seen to help."""
+
+CUT_SHORT_S = 0.5
+"""Left at the end of a recording: far more than lies between its last frame and its end."""
+
+PR_SET_PDEATHSIG = 1
+
+
+class Capture:
+    """One run: from looking for the camera to whatever ends it."""
+
+    def __init__(self, end: socket.socket, request: link.Request, context: rs.context) -> None:
+        self._end = end
+        self._request = request
+        self._camera = SdkCamera(context, request)
+        self._stop = threading.Event()
+        self._taken = threading.Event()
+        self._told_ns = 0
+
+    def run(self) -> None:
+        """Capture until stopped. All that goes wrong is told over the link."""
+        threading.Thread(target=self._listen, name="link", daemon=True).start()
+        try:
+            self._tell(link.Phase("waiting"))
+            self._wait_for_camera()
+            if self._request.reset:
+                self._tell(link.Phase("resetting"))
+                self._camera.reset()
+            self._tell(link.Phase("starting"))
+            self._stream(self._camera.start())
+        except SourceEnded:
+            self._tell(link.Ended())
+        except RecordingBroken as error:
+            self._tell(link.Failed(str(error), final=True))
+        except SourceError as error:
+            self._tell(link.Failed(str(error)))
+        if self._stop.is_set():
+            self._camera.stop()
+
+    def _wait_for_camera(self) -> None:
+        told = ""
+        while not self._stop.is_set():
+            self._camera.changed.clear()
+            reason = self._camera.find()
+            if reason is None:
+                return
+            if reason != told:
+                self._tell(link.Phase("waiting", reason))
+                told = reason
+            self._alive()
+            self._camera.changed.wait(LOOK_EVERY_S)
+
+    def _stream(self, opened: link.Opened) -> None:
+        """Pass frames on until there are no more."""
+        shape: tuple[int, ...] = (opened.height, opened.width)
+        shape += (opened.channels,) if opened.channels > 1 else ()
+        dtype = np.uint16 if self._request.stream == "depth" else np.uint8
+        descriptor = SharedFrames.create(shape, dtype)
+        frames = SharedFrames(descriptor, shape, dtype)
+        link.send(self._end, opened, descriptor)
+        os.close(descriptor)
+        base, last = self._request.number_base, self._request.resume_after
+        deadline_ns = monotonic_ns() + FIRST_FRAME_MS * NS_PER_MS
+        while not self._stop.is_set():
+            try:
+                reading = self._camera.read(READ_MS)
+            except SourceEnded:
+                self._check_complete(last)
+                if not self._request.loop:
+                    raise
+                base += last
+                self._camera.rewind()
+                continue
+            if reading is not None:
+                last = reading.camera_number
+                self._deliver(frames, reading, base + last)
+                deadline_ns = monotonic_ns() + SILENCE_MS * NS_PER_MS
+            elif monotonic_ns() > deadline_ns:
+                raise SourceError(f"camera {opened.serial} stopped sending frames")
+            self._alive()
+
+    def _deliver(self, frames: SharedFrames, reading: Reading, number: int) -> None:
+        self._taken.clear()
+        frames.write(reading.pixels, number, reading.camera_number, reading.captured_at_ns, reading.position_ns)
+        link.offer(self._end, link.Delivered())
+        while self._request.lockstep and not self._stop.is_set() and not self._taken.wait(READ_MS / 1000):
+            # The reader may be busy for long; what was offered may have been lost.
+            link.offer(self._end, link.Delivered())
+
+    def _check_complete(self, last: int) -> None:
+        """The SDK ends a recording without a word where it cannot read on."""
+        if self._camera.left_out_s > CUT_SHORT_S:
+            raise RecordingBroken(
+                f"{self._request.recording}: cannot be read beyond frame {last}, "
+                f"{self._camera.left_out_s:.1f} s before its end; it may be damaged"
+            )
+
+    def _alive(self) -> None:
+        if monotonic_ns() - self._told_ns > ALIVE_EVERY_NS:
+            self._told_ns = monotonic_ns()
+            link.offer(self._end, link.Alive())
+
+    def _tell(self, message: link.Message) -> None:
+        link.send(self._end, message)
+
+    def _listen(self) -> None:
+        """Hear what the other end says, and go when it is gone: even a main thread that hangs then goes along."""
+        while (received := link.receive(self._end)) is not None:
+            message, _ = received
+            if isinstance(message, link.Taken):
+                self._taken.set()
+            elif isinstance(message, link.Stop):
+                self._stop.set()
+                self._taken.set()
+        os._exit(0)
+
+
+def serve(end: socket.socket, context: rs.context) -> None:
+    """Do what the first message of the link asks for."""
+    received = link.receive(end)
+    request = received[0] if received is not None else None
+    if isinstance(request, link.Survey):
+        link.send(end, link.Found(rs.__version__, survey(context)))
+    elif isinstance(request, link.Request):
+        Capture(end, request, context).run()
+
+
+def main(descriptor: int, parent: int) -> NoReturn:
+    """Serve the link behind `descriptor`, for as long as the process `parent` lives."""
+    # Whoever began this ends it, by the link; a Ctrl-C or a stop of the whole service is not for us to act on.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    # The link's end is seen by a thread; should the SDK hang with Python's lock in its hands, the kernel does it.
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    end = socket.socket(fileno=descriptor)
+    if os.getppid() != parent:
+        os._exit(0)
+    try:
+        link.send(end, link.Phase("booting"))
+        serve(end, rs.context())
+        status = 0
+    except (BrokenPipeError, ConnectionResetError):
+        status = 0
+    except Exception as error:  # a bug, or an error that the SDK was never seen to raise: tell it, show it, go
+        link.send(end, link.Failed(f"{type(error).__name__}: {error}"))
+        sys.excepthook(type(error), error, error.__traceback__)
+        status = 1
+    sys.stderr.flush()
+    # The SDK's destructors are known to hang and to abort; the kernel closes the camera as well.
+    os._exit(status)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]))

@@ -7,6 +7,7 @@ In the order of the flow:
     kernels/        the arithmetic, as pure numba functions on arrays
     sources/        where frames come from
     inflation       how a mesh grows by a padding
+    hull            a link as the solid that reaches a few centimetres around it
     expected_depth  what the camera should see: static layer and robot layer (Algorithms 2 to 5)
     halo            what edges of the CAD make the camera see beside them
     reference       the static layer that is learned from the empty cell

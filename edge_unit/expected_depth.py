@@ -2,7 +2,7 @@
 """What the camera should see, in two layers that stay apart: what stands still, and the robot (Algorithms 2 to 5).
 
 The static layer is drawn when the camera or a known object moves. The robot is drawn again when its joints moved,
-only inside the rectangles of its links, twice as large as life by its padding, so that the filter only compares.
+only inside the rectangles of its links, as solids that are its padding larger, so that the filter only compares.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_unit.hull import HULL_M, hull_around
 from edge_unit.inflation import vertex_offsets
 from edge_unit.kernels import limits, rasterize
 from shared.camera import Intrinsics
@@ -122,7 +123,7 @@ class RobotLayer:
     def __init__(self, intrinsics: Intrinsics, robot: Robot | None) -> None:
         self._intrinsics = intrinsics
         self._robot = robot
-        self._batch = MeshBatch([link.mesh for link in robot.links] if robot else [], inflate=True)
+        self._batch = MeshBatch([hull_around(link.mesh) for link in robot.links] if robot else [], inflate=True)
         self._buffer = DepthBuffer(intrinsics)
         self._reach_m = _link_reach(robot)
         self._drawn: tuple[NDArray[np.float64], NDArray[np.float32]] | None = None
@@ -145,7 +146,8 @@ class RobotLayer:
     ) -> bool:
         """Draw the links at poses (L, 4, 4), each grown by its padding (L,) m; returns False when none had moved.
 
-        `noise_per_m` and `depth_m` widen the band as `limits.robot_band_raw` has it. `hidden` (L,) links are left out.
+        `noise_per_m` and `depth_m`, from the padded surface, widen the band as `limits.robot_band_raw` has it.
+        `hidden` (L,) links are left out.
         """
         if hidden is not None and hidden.any():
             T_camera_link = T_camera_link.copy()
@@ -156,7 +158,9 @@ class RobotLayer:
             return False
         self._clear()
         buffer = self._buffer
-        self._batch.draw(self._intrinsics, T_camera_link, padding_m, buffer.nearest_w, buffer.farthest_w)
+        self._batch.draw(
+            self._intrinsics, T_camera_link, padding_m - np.float32(HULL_M), buffer.nearest_w, buffer.farthest_w
+        )
         limits.robot_band_raw(
             buffer.nearest_w,
             buffer.farthest_w,

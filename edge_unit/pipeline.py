@@ -270,7 +270,8 @@ class DepthPipeline:
             self._T_camera_link(joints),
             padding_m.astype(np.float32),
             self.settings.margin_noise_gain * self._noise_per_m,
-            self.settings.robot_depth_m,
+            # The padded surface stands before the true one by the padding.
+            self.settings.robot_depth_m + float(padding_m.max(initial=0.0)),
             hidden,
         )
 

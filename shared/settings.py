@@ -77,7 +77,7 @@ class FilterSettings(BaseModel):
         default=0.15,
         ge=0.0,
         le=1.0,
-        description="What lies deeper than this behind the padded robot is no robot any more, in metres.",
+        description="What lies deeper than this behind the robot's surface is no robot any more, in metres.",
     )
     range_min_m: float = Field(default=0.0, ge=0.0, le=5.0, description="Nearer measurements are ignored, in metres.")
     range_max_m: float = Field(

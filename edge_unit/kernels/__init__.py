@@ -6,6 +6,7 @@ In the order of the flow:
 
     jit         how kernels are compiled
     rasterize   meshes onto the screen: nearest and farthest inverse depth (Algorithms 2 to 4)
+    hull        the surface at a distance from a mesh
     limits      expected depth less margins, as raw depth that a pixel is compared with
     halo        the depths that edges of known surfaces show beside them
     reference   surfaces that the empty cell shows, learned pixel by pixel

@@ -79,6 +79,8 @@ def sentence_of(items: Sequence[Mapping[str, Any]]) -> str:
     parts = []
     for item in items[:SENTENCE_ITEMS]:
         name = ".".join(str(part) for part in item["loc"] if part != "body") or "value"
+        # A name may be a stranger's: as text in one line, and not without end.
+        name = repr(name)[1:-1][:SENTENCE_INPUT_CHARS]
         what = item["msg"][:1].lower() + item["msg"][1:]
         came = f", got {repr(item['input'])[:SENTENCE_INPUT_CHARS]}" if item["type"] != "missing" else ""
         parts.append(f"{name}: {what}{came}")

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_unit.hull import HULL_M, hull_around
+from edge_unit.hull import DISTANCE_MIN_M, hull_around
 from edge_unit.inflation import vertex_offsets
 from edge_unit.kernels import limits, rasterize
 from shared.camera import Intrinsics
@@ -20,7 +20,7 @@ from shared.kinematics import Robot
 from shared.meshes import TriangleMesh
 from shared.transforms import Transform, inverse
 
-NEAR_PLANE_M = 0.05
+NEAR_PLANE_M = 0.01
 """Nearer than any depth camera measures; triangles are clipped here."""
 
 STILL_M = 0.0005
@@ -120,10 +120,13 @@ class StaticLayer:
 class RobotLayer:
     """The padded robot, as the band of raw depths that belongs to it."""
 
-    def __init__(self, intrinsics: Intrinsics, robot: Robot | None) -> None:
+    def __init__(self, intrinsics: Intrinsics, robot: Robot | None, padding_m: float) -> None:
+        """`padding_m` is what the links are usually drawn with: they are prepared for it."""
         self._intrinsics = intrinsics
         self._robot = robot
-        self._batch = MeshBatch([hull_around(link.mesh) for link in robot.links] if robot else [], inflate=True)
+        self._hull_m = max(padding_m, DISTANCE_MIN_M)
+        hulls = [hull_around(link.mesh, self._hull_m) for link in robot.links] if robot else []
+        self._batch = MeshBatch(hulls, inflate=True)
         self._buffer = DepthBuffer(intrinsics)
         self._reach_m = _link_reach(robot)
         self._drawn: tuple[NDArray[np.float64], NDArray[np.float32]] | None = None
@@ -159,7 +162,7 @@ class RobotLayer:
         self._clear()
         buffer = self._buffer
         self._batch.draw(
-            self._intrinsics, T_camera_link, padding_m - np.float32(HULL_M), buffer.nearest_w, buffer.farthest_w
+            self._intrinsics, T_camera_link, padding_m - np.float32(self._hull_m), buffer.nearest_w, buffer.farthest_w
         )
         limits.robot_band_raw(
             buffer.nearest_w,

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A link as the solid that reaches a few centimetres around it: what is drawn of the padded robot.
+"""A link as the solid that reaches its padding around it: what is drawn of the robot for the filter.
 
-CAD of robots is fine, full of parts that nobody sees, and seldom closed. Around it, at a distance that the padding
-covers anyway, lies a surface that is smooth, closed and has few triangles, whatever the mesh was like.
+CAD of robots is fine, full of parts that nobody sees, and seldom closed. The surface at some distance around it is
+smooth, closed and has few triangles, whatever the mesh was like.
 """
 
 from __future__ import annotations
@@ -14,71 +14,79 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.kernels import hull as kernels
+from shared.errors import InputError
 from shared.meshes import TriangleMesh
 
 logger = logging.getLogger(__name__)
 
-HULL_M = 0.025
-"""Distance of the hull from the mesh. Less would need a finer grid; more would leave no room for smaller paddings."""
+DISTANCE_MIN_M = 0.015
+"""A nearer hull would need a grid too fine for its size."""
 
-GRID_M = 0.006
-"""Spacing of the grid: a quarter of the distance resolves its bends."""
+GRID_SHARE = 0.25
+"""Spacing of the grid in parts of the distance, which is the hull's narrowest bend."""
 
 GRID_NODES_MAX = 2_000_000
-"""8 MB of distances: beyond it (a link of 0.7 m edge) the grid is coarser."""
+"""8 MB of distances; for a larger link the grid is coarser."""
 
-SAMPLE_M = 0.003
-"""Spacing of the points that stand for the mesh; at the hull's distance it changes that by less than 0.1 mm."""
+SAMPLE_SHARE = 0.1
+"""Spacing of the points that stand for the mesh in parts of the distance; it changes that by less than a hundredth."""
 
 SIMPLIFY_M = 0.001
 """How far the simplified hull may leave the grid's."""
 
-
 HULLS_MAX = 64
 """Hulls kept for meshes met again, as when the cell is sent anew: two arms with their tools."""
 
-_hulls: dict[str, TriangleMesh] = {}
+_hulls: dict[tuple[str, float], TriangleMesh] = {}
 
 
-def hull_around(mesh: TriangleMesh) -> TriangleMesh:
-    """The outer surface at `HULL_M` from `mesh`, within some 2 mm; closed, however open the mesh was.
+def hull_around(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
+    """The outer surface at `distance_m` from `mesh`, within some 2 mm; closed, however open the mesh was.
 
-    Takes a tenth of a second a link; the same mesh has its hull at once.
+    Takes some hundredths of a second; the same mesh has its hull at once.
+
+    Raises:
+        InputError: the distance is below `DISTANCE_MIN_M`.
     """
-    hull = _hulls.pop(mesh.sha256, None) or _make_hull(mesh)
+    if not distance_m >= DISTANCE_MIN_M:
+        raise InputError(f"hull of {mesh.name}: expected a distance of at least {DISTANCE_MIN_M} m, got {distance_m}")
+    hull = _hulls.pop((mesh.sha256, distance_m), None) or _make_hull(mesh, distance_m)
     while len(_hulls) >= HULLS_MAX:
         del _hulls[next(iter(_hulls))]
-    _hulls[mesh.sha256] = hull
+    _hulls[mesh.sha256, distance_m] = hull
     return hull
 
 
-def _make_hull(mesh: TriangleMesh) -> TriangleMesh:
+def _make_hull(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
     """What `hull_around` keeps."""
-    low = mesh.vertices.min(axis=0) - (HULL_M + 3.0 * GRID_M)
-    size = mesh.vertices.max(axis=0) + (HULL_M + 3.0 * GRID_M) - low
-    spacing_m = max(GRID_M, float((np.prod(size) / GRID_NODES_MAX) ** (1.0 / 3.0)))
-    field = _distance(mesh, low, np.ceil(size / spacing_m).astype(int) + 1, spacing_m) - np.float32(HULL_M)
+    grid_m = GRID_SHARE * distance_m
+    low = mesh.vertices.min(axis=0) - np.float32(distance_m + 3.0 * grid_m)
+    size = mesh.vertices.max(axis=0) + np.float32(distance_m + 3.0 * grid_m) - low
+    grid_m = max(grid_m, float((np.prod(size) / GRID_NODES_MAX) ** (1.0 / 3.0)))
+    shape = np.ceil(size / grid_m).astype(int) + 1
+    field = _distance(mesh, low, shape, grid_m, distance_m) - np.float32(distance_m)
     outside = np.empty(field.shape, np.bool_)
     kernels.flood_outside(field < 0.0, outside, np.empty(field.size, np.int64))
     # A cavity is inside, too.
-    field[~outside & (field >= 0.0)] = -spacing_m
+    field[~outside & (field >= 0.0)] = -grid_m
     vertices, faces = _surface(field)
-    return _simplified(mesh.name, (vertices * np.float32(spacing_m) + low).astype(np.float32), faces)
+    return _simplified(mesh.name, (vertices * np.float32(grid_m) + low).astype(np.float32), faces)
 
 
 def _distance(
-    mesh: TriangleMesh, origin_m: NDArray[np.float32], shape: NDArray[np.int64], spacing_m: float
+    mesh: TriangleMesh, origin_m: NDArray[np.float32], shape: NDArray[np.int64], grid_m: float, distance_m: float
 ) -> NDArray[np.float32]:
     """Distance (nx, ny, nz) in metres of the grid's nodes from the mesh, as far as it matters."""
-    number = kernels.sample_faces(mesh.vertices, mesh.faces, SAMPLE_M, np.empty((0, 3), np.float32))
+    spacing_m = SAMPLE_SHARE * distance_m
+    number = kernels.sample_faces(mesh.vertices, mesh.faces, spacing_m, np.empty((0, 3), np.float32))
     samples_m = np.empty((number, 3), np.float32)
-    kernels.sample_faces(mesh.vertices, mesh.faces, SAMPLE_M, samples_m)
+    kernels.sample_faces(mesh.vertices, mesh.faces, spacing_m, samples_m)
     # Fine meshes give many more points than are needed; one of each grain will do.
-    _, first = np.unique(np.floor(samples_m / SAMPLE_M).astype(np.int32), axis=0, return_index=True)
-    reach = int(np.ceil((HULL_M + spacing_m) / spacing_m))
-    far_m = HULL_M + 2.0 * spacing_m
+    _, first = np.unique(np.floor(samples_m / (0.5 * spacing_m)).astype(np.int32), axis=0, return_index=True)
+    reach = int(np.ceil((distance_m + grid_m) / grid_m))
+    far_m = distance_m + 2.0 * grid_m
     squared_m2 = np.full(tuple(shape), far_m * far_m, np.float32)
-    kernels.spread_distance(samples_m[first], origin_m.astype(np.float32), np.float32(spacing_m), reach, squared_m2)
+    kernels.spread_distance(samples_m[first], origin_m.astype(np.float32), np.float32(grid_m), reach, squared_m2)
     return np.sqrt(squared_m2)
 
 

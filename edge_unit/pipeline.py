@@ -83,7 +83,7 @@ class DepthPipeline:
         self._room_raw = np.empty(intrinsics.shape, np.uint16)
         self._scratch_raw = np.empty((2, *intrinsics.shape), np.uint16)
         self._unlearned = np.full(intrinsics.shape, np.nan, np.float32)
-        self._depth_raw = np.zeros(intrinsics.shape, np.uint16)
+        self._no_depth_raw = np.zeros(intrinsics.shape, np.uint16)
         self._halo = EdgeHalo(intrinsics)
         self._health = HealthCheck(intrinsics)
         self.use_cell(cell)
@@ -211,8 +211,10 @@ class DepthPipeline:
         """
         voxelizer = Voxelizer(self.intrinsics, self.T_world_camera, self.cell.lattice(settings.voxel_size_m), settings)
         visibility = self._look_from(self.T_world_camera, settings)
+        if settings.robot_padding_m != self.settings.robot_padding_m:
+            self._robot = RobotLayer(self.intrinsics, self.cell.robot, settings.robot_padding_m)
         self.settings, self._voxelizer, self._visibility = settings, voxelizer, visibility
-        self._robot.forget()
+        self._forget_frame()
         self._renew_static()
 
     def move(self, T_world_camera: ArrayLike, *, refined: bool = False) -> None:
@@ -229,7 +231,7 @@ class DepthPipeline:
             self.reference = None
         self._voxelizer.place(self.T_world_camera)
         self._visibility.place(self.T_world_camera)
-        self._robot.forget()
+        self._forget_frame()
         self._draw_cad()
         self._renew_static()
 
@@ -242,11 +244,12 @@ class DepthPipeline:
         self._voxelizer = voxelizer
         self._visibility = self._look_from(self.T_world_camera, self.settings)
         self._cad = StaticLayer(self.intrinsics, [placed.mesh for placed in (*cell.static, *cell.objects)])
-        self._robot = RobotLayer(self.intrinsics, cell.robot)
+        self._robot = RobotLayer(self.intrinsics, cell.robot, self.settings.robot_padding_m)
         self._bare_robot = BareRobot(self.intrinsics, cell.robot)
         self._divided = np.empty(self.intrinsics.shape, np.float32)
         links = cell.robot.links if cell.robot else ()
         self._fixed_links = np.array([not link.moving for link in links], np.bool_)
+        self._forget_frame()
         self._draw_cad()
         self._renew_static()
 
@@ -289,6 +292,11 @@ class DepthPipeline:
         )
         self._halo.drop(depth_raw, self._mask)
 
+    def _forget_frame(self) -> None:
+        """The last frame showed another place, or was filtered by other rules: until the next, nothing is seen."""
+        self._robot.forget()
+        self._depth_raw = self._no_depth_raw
+
     def _draw_cad(self) -> None:
         placed = (*self.cell.static, *self.cell.objects)
         self._cad.draw(self.T_world_camera, [each.T_world_mesh for each in placed])
@@ -315,7 +323,7 @@ class DepthPipeline:
         )
         radius_px = round(settings.edge_radius_px * camera.width / EDGE_RADIUS_WIDTH_PX)
         limits.nearest_over(raw, radius_px, scratch, self._limit_raw)
-        self._minimum_raw = max(int(np.ceil(settings.range_min_m / camera.depth_scale_m)), 1)
+        self._minimum_raw = min(max(int(np.ceil(settings.range_min_m / camera.depth_scale_m)), 1), limits.RAW_MAX)
         np.subtract(np.maximum(self._limit_raw, self._minimum_raw), self._minimum_raw, out=self._room_raw)
         w = self._cad.nearest_w
         self._halo.renew(w, settings.static_padding_m, settings.margin_base_m, cad_noise_per_m)
@@ -343,9 +351,10 @@ class DepthPipeline:
             uncertainty = np.asarray(joint_uncertainty_rad, np.float64)
         except (TypeError, ValueError) as error:
             raise InputError(f"joint_uncertainty_rad: expected numbers, got {joint_uncertainty_rad!r}") from error
-        if uncertainty.shape not in ((), (count,)) or not (uncertainty >= 0.0).all():
+        sound = (uncertainty >= 0.0) & np.isfinite(uncertainty)
+        if uncertainty.shape not in ((), (count,)) or not sound.all():
             raise InputError(
-                f"joint_uncertainty_rad: expected one number or {count}, none negative or NaN, "
+                f"joint_uncertainty_rad: expected one finite number of at least 0, or {count}, "
                 f"got {uncertainty.tolist()}"
             )
         return np.broadcast_to(uncertainty, (count,))

@@ -6,12 +6,12 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from edge_unit.expected_depth import STILL_M, BareRobot, MeshBatch, RobotLayer, StaticLayer
-from edge_unit.inflation import vertex_offsets
+from edge_unit.hull import hull_around
 from edge_unit.kernels.limits import RAW_MAX
 from edge_unit.pipeline import DepthPipeline
 from shared.cell import Cell, PlacedMesh
 from shared.kinematics import Robot
-from shared.meshes import TriangleMesh, box_mesh, sphere_mesh
+from shared.meshes import box_mesh, sphere_mesh
 from shared.transforms import Transform, from_xyz_rpy, inverse, look_at
 from tests.edge_unit.scenes import (
     ABOVE_TABLE,
@@ -26,6 +26,7 @@ from tests.edge_unit.scenes import (
     small_robot,
 )
 
+PADDING_M = 0.05
 NOISE_PER_M, DEPTH_M = 0.02, 0.15
 
 # ---------------------------------------------------------------- against an independent ray caster
@@ -144,7 +145,7 @@ class Arm:
     def __init__(self, robot: Robot | None = None) -> None:
         self.intrinsics = camera(424, 240)
         self.robot = robot or small_robot()
-        self.layer = RobotLayer(self.intrinsics, self.robot)
+        self.layer = RobotLayer(self.intrinsics, self.robot, PADDING_M)
 
     def poses(self, *joints: float) -> NDArray[np.float64]:
         return inverse(OVERHEAD) @ self.robot.T_world_base @ self.robot.link_poses(joints)
@@ -163,14 +164,13 @@ class Arm:
         return raycast(bodies(cell, [angle_rad]), OVERHEAD, self.intrinsics)
 
 
-def test_the_band_is_that_of_rays_on_the_inflated_links() -> None:
+def test_the_band_is_that_of_rays_on_the_inflated_hulls() -> None:
     arm = Arm()
     assert arm.draw(0.4)
     each_m = []
     for link, pose in zip(arm.robot.links, arm.robot.link_poses([0.4]), strict=True):
-        vertices = link.mesh.vertices + np.float32(0.05) * vertex_offsets(link.mesh)
-        inflated = TriangleMesh(link.name, vertices, link.mesh.faces, link.mesh.closed)
-        each_m.append(raycast([PlacedMesh(link.name, inflated, pose)], OVERHEAD, arm.intrinsics))
+        hull = hull_around(link.mesh, PADDING_M)
+        each_m.append(raycast([PlacedMesh(link.name, hull, pose)], OVERHEAD, arm.intrinsics))
     near_m = np.min(each_m, axis=0)
     hit = np.isfinite(near_m)
     far_m = np.max([np.where(np.isfinite(z), z, 0.0) for z in each_m], axis=0)[hit]
@@ -274,7 +274,7 @@ def test_hidden_links_are_left_out() -> None:
 
 
 def test_without_a_robot_nothing_is_drawn() -> None:
-    layer = RobotLayer(camera(64, 40), None)
+    layer = RobotLayer(camera(64, 40), None, PADDING_M)
     assert (layer.near_raw == RAW_MAX).all()
     layer.forget()
     assert not layer.span_raw.any()

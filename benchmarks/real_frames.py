@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -127,9 +128,7 @@ def load(folder: Path, pipeline: DepthPipeline) -> RealFrames:
     frames = range(len(EMPTY_FRAMES) + len(WATCHED_FRAMES))
     depth = np.stack([_image(folder / "depth" / f"{frame:02d}.png") for frame in frames])
     colour = np.stack([_image(folder / "color" / f"{frame:02d}.png") for frame in frames])
-    robot_mask = np.stack([_image(folder / "mask" / f"{frame:02d}.png").squeeze() > 0 for frame in frames])
-    if robot_mask.ndim == 4:
-        robot_mask = robot_mask.any(axis=-1)
+    robot_mask = np.stack([_image(folder / "mask" / f"{frame:02d}.png", cv2.IMREAD_GRAYSCALE) > 0 for frame in frames])
     joints = np.loadtxt(folder / "joint_states_rad.csv", delimiter=",")
     pipeline.use(pipeline.learn((depth[frame], joints[frame]) for frame in EMPTY_FRAMES))
     return RealFrames(pipeline, depth, colour[..., :3], robot_mask, joints)
@@ -146,8 +145,8 @@ def default_settings() -> FilterSettings:
     return FilterSettings()
 
 
-def _image(path: Path) -> NDArray[np.generic]:
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+def _image(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
+    image = cv2.imread(str(path), flags)
     if image is None:
         raise SourceError(f"{path}: no image")
-    return image
+    return np.asarray(image)

@@ -6,9 +6,9 @@ In the order of the flow:
     config       the master's own configuration
     access       who may do what: two tokens
     robot        the robot's joints, as a short history
-    registry     the units' slots and how far each can be trusted (Algorithm 8)
     coverage     what the units look through, united
     merge        the units' voxels, merged (Algorithm 9)
+    registry     the units' slots and how far each can be trusted (Algorithm 8)
     master       all of that held together, without a network
     routes/      the same as HTTP
     app          the web application, assembled

@@ -56,14 +56,17 @@ def ip_of(scope: Scope) -> str:
 
 
 class Negotiated(APIRoute):
-    """JSON by default, msgpack where `Content-Type` or `Accept` says so; every body within bounds."""
+    """JSON by default, msgpack where `Content-Type` or `Accept` says so; every body within bounds.
+
+    Refusals are JSON always.
+    """
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         handler = super().get_route_handler()
 
         async def negotiated(request: Request) -> Response:
             response = await handler(await _as_json(request))
-            if response.media_type == "application/json" and wants_msgpack(request):
+            if response.body and response.media_type == "application/json" and wants_msgpack(request):
                 packed = msgpack.packb(json.loads(bytes(response.body)))
                 return Response(packed, response.status_code, media_type=MEDIA_TYPE)
             return response

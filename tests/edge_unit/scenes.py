@@ -61,7 +61,7 @@ def small_robot() -> Robot:
 def small_cell(robot: bool = True, floor: bool = True) -> Cell:
     """A box of 2 m about a floor at z = 0, a crate that may be moved, and perhaps the small robot."""
     ground = (placed("floor", box_mesh("floor", (2.0, 2.0, 0.02)), (0, 0, -0.01)),)
-    crate = (placed("crate", box_mesh("crate", (0.3, 0.2, 0.2)), (0.5, 0.5, 0.1)),)
+    crate = (placed("crate", box_mesh("crate", (0.3, 0.2, 0.4)), (0.5, 0.5, 0.2)),)
     return Cell(
         "small",
         np.array((-1.0, -1.0, -0.2)),

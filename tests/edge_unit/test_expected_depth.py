@@ -150,7 +150,7 @@ class Arm:
     def poses(self, *joints: float) -> NDArray[np.float64]:
         return inverse(OVERHEAD) @ self.robot.T_world_base @ self.robot.link_poses(joints)
 
-    def draw(self, angle_rad: float, padding_m: ArrayLike = 0.05, hidden: list[bool] | None = None) -> bool:
+    def draw(self, angle_rad: float, padding_m: ArrayLike = PADDING_M, hidden: list[bool] | None = None) -> bool:
         padding = np.broadcast_to(np.asarray(padding_m, np.float32), (len(self.robot.links),))
         mask = None if hidden is None else np.array(hidden)
         return self.layer.draw(self.poses(angle_rad), np.ascontiguousarray(padding), NOISE_PER_M, DEPTH_M, mask)

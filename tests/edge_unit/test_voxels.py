@@ -120,7 +120,8 @@ def test_a_camera_that_moved_sees_the_same_things_where_they_are() -> None:
 def plate(intrinsics: Intrinsics, z_m: float, side_m: float, shift_m: tuple[float, float] = (0, 0)) -> Depth:
     """A square that faces the camera; nothing else is measured."""
     v, u = np.mgrid[0 : intrinsics.height, 0 : intrinsics.width]
-    x, y = (u - intrinsics.cx) / intrinsics.fx * z_m - shift_m[0], (v - intrinsics.cy) / intrinsics.fy * z_m - shift_m[1]
+    x = (u - intrinsics.cx) / intrinsics.fx * z_m - shift_m[0]
+    y = (v - intrinsics.cy) / intrinsics.fy * z_m - shift_m[1]
     inside = (np.abs(x) <= side_m / 2) & (np.abs(y) <= side_m / 2)
     return np.where(inside, round(z_m / intrinsics.depth_scale_m), 0).astype(np.uint16)
 

@@ -108,6 +108,7 @@ class Voxelizer:
             settings.occupancy_threshold,
             settings.own_share_min,
             settings.support_area_max_m2,
+            settings.support_points_min,
             self._kept,
         )
         keys = np.sort(self._kept[:kept])

@@ -22,7 +22,7 @@ class FilterSettings(BaseModel):
 
     voxel_size_m: float = Field(default=0.05, ge=0.01, le=0.10, description="Edge of a voxel in metres.")
     occupancy_threshold: float = Field(
-        default=0.75,
+        default=0.6,
         ge=0.05,
         le=2.0,
         description="Share of the points that one full voxel would show at its distance; less is noise.",
@@ -43,11 +43,18 @@ class FilterSettings(BaseModel):
         le=0.01,
         description="Never ask for more surface than this (m2), so that thin things survive large voxels.",
     )
+    support_points_min: int = Field(
+        default=40,
+        ge=0,
+        le=10_000,
+        description="Never decide on fewer points than this: neighbouring pixels are matched by one window, and far "
+        "away or at a low resolution one wrong match fills a voxel. Three full voxels are always enough.",
+    )
     margin_base_m: float = Field(
-        default=0.04, ge=0.0, le=0.5, description="Constant part of the margin before CAD surfaces, in metres."
+        default=0.03, ge=0.0, le=0.5, description="Constant part of the margin before CAD surfaces, in metres."
     )
     margin_noise_gain: float = Field(
-        default=3.0, ge=0.0, le=20.0, description="Standard deviations of stereo noise in the margin before CAD."
+        default=4.0, ge=0.0, le=20.0, description="Standard deviations of stereo noise in the margin before CAD."
     )
     stereo_subpixel_px: float = Field(
         default=0.12, ge=0.01, le=1.0, description="Standard deviation of the camera's disparity, in pixels."
@@ -56,7 +63,7 @@ class FilterSettings(BaseModel):
         default=0.05, ge=0.0, le=0.5, description="Constant part of the margin before learned surfaces, in metres."
     )
     reference_spread_gain: float = Field(
-        default=5.0, ge=0.0, le=20.0, description="Standard deviations of a learned pixel in its margin."
+        default=7.5, ge=0.0, le=20.0, description="Standard deviations of a learned pixel in its margin."
     )
     edge_radius_px: int = Field(
         default=6,

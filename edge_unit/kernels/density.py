@@ -15,6 +15,10 @@ from numpy.typing import NDArray
 
 from edge_unit.kernels.jit import kernel
 
+FLOOR_VOXELS = 3.0
+"""The floor of points never asks for more than this many full voxels: small voxels far away hold few points, and a
+surface that crosses the neighbourhood fills about nine."""
+
 
 @kernel
 def expected_pinhole(size_m: float, z_m: float, fx: float, fy: float) -> float:
@@ -60,6 +64,7 @@ def keep_dense(
     threshold: float,
     own_share_min: float,
     support_area_max_m2: float,
+    support_points_min: float,
     kept: NDArray[np.uint32],
 ) -> int:
     """List the touched voxels that are dense enough in `kept`; returns how many.
@@ -67,7 +72,8 @@ def keep_dense(
     `first_centre_camera_m` (3,) is the middle of voxel (0, 0, 0) in the camera frame and `axes_camera` (3, 3) has as
     columns the steps to the next voxel along each lattice axis. `single` is the paper's Algorithm 7: a voxel's own
     count against `threshold` of the full count. Else the 27-neighbourhood is held against `threshold` of the full count
-    of at most `support_area_max_m2`, and the voxel's own against `own_share_min`.
+    of at most `support_area_max_m2`, but no less than `support_points_min` or `FLOOR_VOXELS` full voxels, and the
+    voxel's own against `own_share_min`.
     """
     nx, ny, nz = shape[0], shape[1], shape[2]
     area_m2 = voxel_size_m * voxel_size_m
@@ -89,7 +95,7 @@ def keep_dense(
         if single:
             dense = own >= threshold * full
         else:
-            needed = threshold * cap * full
+            needed = max(threshold * cap * full, min(support_points_min, FLOOR_VOXELS * full))
             dense = own >= own_share_min * full and (
                 own >= needed or neighbourhood_count(counts, ix, iy, iz, nx, ny, nz) >= needed
             )

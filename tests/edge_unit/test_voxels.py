@@ -15,7 +15,7 @@ from tests.edge_unit.scenes import Depth, camera
 DOUBT_M = 2e-5
 """The kernel works in float32: this close to a border a point may fall on either side."""
 
-KEEP_ALL = FilterSettings(occupancy_threshold=0.05, own_share_min=0.0, support_area_max_m2=1e-4)
+KEEP_ALL = FilterSettings(occupancy_threshold=0.05, own_share_min=0.0, support_area_max_m2=1e-4, support_points_min=0)
 
 
 def padded(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -25,6 +25,7 @@ def kept(
     threshold: float = 0.75,
     own_share_min: float = 0.05,
     area_max_m2: float = 0.0025,
+    points_min: float = 0.0,
     touched: NDArray[np.uint32] | None = None,
 ) -> set[int]:
     if touched is None:
@@ -48,6 +49,7 @@ def kept(
         threshold,
         own_share_min,
         area_max_m2,
+        points_min,
         out,
     )
     assert len(set(out[:number].tolist())) == number
@@ -63,6 +65,7 @@ def twin(
     threshold: float,
     own_share_min: float,
     area_max_m2: float,
+    points_min: float,
 ) -> set[int]:
     """All voxels at once, with scipy's convolution for the neighbourhood."""
     size_m = lattice.voxel_size_m
@@ -78,7 +81,8 @@ def twin(
     else:
         around = ndimage.convolve(counts.astype(np.int64), np.ones((3, 3, 3), np.int64), mode="constant")
         share = min(area_max_m2 / size_m**2, 1.0)
-        dense = (around >= threshold * share * full) & (counts >= own_share_min * full)
+        needed = np.maximum(threshold * share * full, np.minimum(points_min, 3.0 * full))
+        dense = (around >= needed) & (counts >= own_share_min * full)
     return set(np.nonzero((dense & (counts > 0)).ravel())[0].tolist())
 
 
@@ -96,7 +100,7 @@ def test_keeps_what_the_twin_keeps(angular: bool, single: bool, size_m: float, s
         z_m = apply(inverse(pose), lattice.centres(np.moveaxis(np.indices(shape), 0, -1)))[..., 2]
         full = FX * FY * (size_m / np.maximum(np.abs(z_m), 0.1)) ** 2
         counts = rng.poisson(full * rng.uniform(0.0, 2.0, shape) * (rng.random(shape) < 0.5)).astype(np.uint32)
-        figures = (rng.uniform(0.05, 1.5), rng.uniform(0.0, 0.2), rng.uniform(1e-4, 0.01))
+        figures = (rng.uniform(0.05, 1.5), rng.uniform(0.0, 0.2), rng.uniform(1e-4, 0.01), rng.uniform(0, 80))
         wanted = twin(counts, lattice, pose, angular, single, *figures)
         assert kept(counts, lattice, pose, angular, single, *figures) == wanted
         sizes.append(len(wanted) / max(np.count_nonzero(counts), 1))
@@ -142,6 +146,27 @@ def test_large_voxels_never_ask_for_more_than_a_hand() -> None:
     pose = from_xyz_rpy((0, 0, 0), (0, 0, 0))
     assert len(kept(counts, lattice, pose, threshold=0.95)) == 1
     assert len(kept(counts, lattice, pose, threshold=0.95, area_max_m2=0.01)) == 0
+
+
+def test_few_points_decide_nothing_however_far_away() -> None:
+    """At 5 m a voxel of 5 cm is full with ten points, and one wrong match has more."""
+    lattice = Lattice((-0.5, -0.5, 4.5), 0.05, (20, 20, 20))
+    pose = from_xyz_rpy((0, 0, 0), (0, 0, 0))
+    counts = np.zeros(lattice.shape, np.uint32)
+    counts[9:11, 9, 9] = 11
+    assert len(kept(counts, lattice, pose)) == 2
+    assert kept(counts, lattice, pose, points_min=40) == set()
+    # A wall still shows three full voxels.
+    counts[8:12, 8:12, 9] = 10
+    assert len(kept(counts, lattice, pose, points_min=40)) == 16
+
+
+def test_the_floor_of_points_leaves_small_voxels_alone() -> None:
+    """At 3 m a voxel of 1 cm is full with one point: no neighbourhood ever holds forty."""
+    lattice = Lattice((-0.1, -0.1, 2.9), 0.01, (20, 20, 20))
+    counts = np.zeros(lattice.shape, np.uint32)
+    counts[5:15, 5:15, 10] = 1
+    assert len(kept(counts, lattice, from_xyz_rpy((0, 0, 0), (0, 0, 0)), points_min=40)) == 100
 
 
 def test_expected_counts() -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any
@@ -60,7 +61,7 @@ class MasterClient:
         self._http.headers = httpx.Headers({"Accept": MEDIA_TYPE})
 
     async def __aenter__(self) -> MasterClient:
-        self.authorize()
+        await self.authorize()
         return self
 
     async def __aexit__(
@@ -68,13 +69,14 @@ class MasterClient:
     ) -> None:
         await self._http.aclose()
 
-    def authorize(self) -> None:
+    async def authorize(self) -> None:
         """Read the token again.
 
         Raises:
             ConfigError: there is none.
         """
-        self._http.headers["Authorization"] = f"Bearer {self._read_token()}"
+        token = await asyncio.to_thread(self._read_token)
+        self._http.headers["Authorization"] = f"Bearer {token}"
 
     async def initialize(self, request: InitializeRequest) -> InitializeAnswer:
         """Ask for a slot. Raises as `update`."""

@@ -187,7 +187,7 @@ class Uplink:
             self._wake.clear()
             await self._wake.wait()
         camera = self._camera
-        self._client.authorize()
+        await self._client.authorize()
         sent_at_ns = monotonic_ns()
         answer = await self._client.initialize(
             InitializeRequest(

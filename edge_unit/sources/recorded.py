@@ -8,6 +8,7 @@ camera it can wait. Capture times are those of the delivery.
 from __future__ import annotations
 
 import asyncio
+import io
 import os
 import re
 import zipfile
@@ -248,7 +249,8 @@ def _decoded(path: Path) -> object:
         if image is None:
             raise SourceError(f"{path}: no PNG image")
         return image
-    loaded = np.load(path, allow_pickle=False)
+    # Read here, for numpy leaves a broken file open.
+    loaded = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
     if isinstance(loaded, np.ndarray):
         return loaded
     with loaded:

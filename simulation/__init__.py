@@ -13,4 +13,11 @@ and tests need no clock. In the order of the flow:
     depth_noise  the faults of a stereo depth camera
     truth        which voxels should be reported, and which must not
     camera       a depth camera in the world, and where a cell's cameras hang
+    controller   the robot's controller: reports its joints to the master
+    warm_up      compiles what a simulated unit needs, once for many
+    evaluation   what units reported, held against what was there
+    processes    child processes that never outlive their parent
+    fleet        a master, its units and the controller as real processes
+    table        the demo's live table
+    demo         the command line
 """

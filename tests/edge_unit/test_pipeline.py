@@ -113,6 +113,21 @@ def test_a_range_beyond_16_bits_ignores_everything() -> None:
     assert watched.foreground(np.full(fine.shape, 60000, np.uint16), None).sum() == 0
 
 
+def test_known_edges_have_a_halo_and_no_more() -> None:
+    """Stereo matching makes known things look 30 mm wider; 150 mm beside them somebody left other ones."""
+    cell = small_cell(robot=False)
+    watched = pipeline(cell)
+    empty_m = raycast(bodies(cell, None), OVERHEAD, CAMERA)
+
+    def wider(radius_px: int) -> Depth:
+        v, u = np.mgrid[-radius_px : radius_px + 1, -radius_px : radius_px + 1]
+        return measured(ndimage.minimum_filter(empty_m, footprint=np.hypot(u, v) <= radius_px), CAMERA)
+
+    assert (wider(4) != wider(0)).sum() > 300
+    assert not watched.foreground(wider(4), None).any()
+    assert len(watched.process(wider(20), None)) > 5
+
+
 # ---------------------------------------------------------------- the robot
 
 

@@ -15,7 +15,9 @@ A RealSense camera is captured by a process of its own, which alone loads the SD
     camera_clock        the camera's time stamps on our clock
     capture_link        what the capture process is asked, and what it tells
     shared_frames       frames in memory that both processes see
-    sdk_camera          one camera or recording, as the SDK has it
+    sdk_devices         which cameras the SDK sees, and the one that is wanted
+    sdk_clock           when a frame of the SDK was taken
+    sdk_stream          one stream of one camera or recording
     sdk_recorder        recordings written from images
     capture_process     the process: from looking for the camera to whatever ends it
     watchdog            when it counts as stuck, and how the next one begins

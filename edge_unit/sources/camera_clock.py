@@ -57,7 +57,11 @@ class CameraClock:
             if suspect is None or not _agree(reading, suspect):
                 return
         self._suspect = None
+        jumps = self._offset.jumps
         self._offset.add(reading)
+        if self._offset.jumps > jumps:
+            # Frames of before tell nothing of the clock as it is set now.
+            self._fastest = None
 
     def captured_at_ns(self, camera_ns: int, arrived_ns: int) -> int:
         """When a frame with the camera's stamp `camera_ns` was taken, by our clock; never after `arrived_ns`."""

@@ -52,7 +52,9 @@ class Survey:
 
 @dataclass(frozen=True)
 class Taken:
-    """The reader has the newest frame; in lockstep the next may come."""
+    """The reader has the frame of this number; in lockstep the next may come."""
+
+    number: int
 
 
 @dataclass(frozen=True)
@@ -115,10 +117,14 @@ class Ended:
 
 @dataclass(frozen=True)
 class Failed:
-    """Capture cannot go on; `final` when to begin anew would end the same way."""
+    """Capture cannot go on; to begin anew would end the same way when it is `final`, and is no matter of course if not.
+
+    `unplugged` tells that nothing is wrong but the plug.
+    """
 
     reason: str
     final: bool = False
+    unplugged: bool = False
 
 
 @dataclass(frozen=True)

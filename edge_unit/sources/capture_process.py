@@ -14,24 +14,23 @@ import signal
 import socket
 import sys
 import threading
-from typing import NoReturn
+from collections.abc import Callable
+from typing import Any, NoReturn
 
 import numpy as np
 import pyrealsense2 as rs
 
 from edge_unit.sources import capture_link as link
-from edge_unit.sources.sdk_camera import Reading, RecordingBroken, SdkCamera, survey
+from edge_unit.sources.sdk_devices import Devices, RecordingBroken, Unplugged, survey
+from edge_unit.sources.sdk_stream import Reading, SdkStream
 from edge_unit.sources.shared_frames import SharedFrames
 from shared.clock import NS_PER_MS, monotonic_ns
 from shared.errors import SourceEnded, SourceError
 
-READ_MS = 100
+READ_S = 0.1
 """How long one wait for a frame may be; then whoever listens is told that we live."""
 
 ALIVE_EVERY_NS = 100 * NS_PER_MS
-
-LOOK_EVERY_S = 0.5
-"""For a camera that is not there, since the SDK's own notice is sometimes missed."""
 
 FIRST_FRAME_MS = 6_000
 """From the start of the stream: cameras settle their exposure first, some for seconds."""
@@ -51,9 +50,10 @@ class Capture:
     def __init__(self, end: socket.socket, request: link.Request, context: rs.context) -> None:
         self._end = end
         self._request = request
-        self._camera = SdkCamera(context, request)
+        self._devices = Devices(context, request)
         self._stop = threading.Event()
-        self._taken = threading.Event()
+        self._taken = threading.Condition()
+        self._taken_number = 0
         self._told_ns = 0
 
     def run(self) -> None:
@@ -61,36 +61,37 @@ class Capture:
         threading.Thread(target=self._listen, name="link", daemon=True).start()
         try:
             self._tell(link.Phase("waiting"))
-            self._wait_for_camera()
-            if self._request.reset:
-                self._tell(link.Phase("resetting"))
-                self._camera.reset()
-            self._tell(link.Phase("starting"))
-            self._stream(self._camera.start())
+            device = self._wait_for_device()
+            if device is not None:
+                if self._request.reset:
+                    self._tell(link.Phase("resetting"))
+                    device = self._devices.reset(device)
+                self._tell(link.Phase("starting"))
+                self._stream(SdkStream(device, self._request))
         except SourceEnded:
             self._tell(link.Ended())
         except RecordingBroken as error:
             self._tell(link.Failed(str(error), final=True))
         except SourceError as error:
-            self._tell(link.Failed(str(error)))
-        if self._stop.is_set():
-            self._camera.stop()
+            self._tell(link.Failed(str(error), unplugged=isinstance(error, Unplugged)))
 
-    def _wait_for_camera(self) -> None:
+    def _wait_for_device(self) -> Any:
+        """The device, or None when there is no more need of it."""
         told = ""
         while not self._stop.is_set():
-            self._camera.changed.clear()
-            reason = self._camera.find()
-            if reason is None:
-                return
+            device, reason = self._devices.find()
+            if device is not None:
+                return device
             if reason != told:
                 self._tell(link.Phase("waiting", reason))
                 told = reason
             self._alive()
-            self._camera.changed.wait(LOOK_EVERY_S)
+            self._devices.wait()
+        return None
 
-    def _stream(self, opened: link.Opened) -> None:
-        """Pass frames on until there are no more."""
+    def _stream(self, stream: SdkStream) -> None:
+        """Pass frames on until there are no more, or nobody wants any."""
+        opened = stream.start()
         shape: tuple[int, ...] = (opened.height, opened.width)
         shape += (opened.channels,) if opened.channels > 1 else ()
         dtype = np.uint16 if self._request.stream == "depth" else np.uint8
@@ -101,14 +102,16 @@ class Capture:
         base, last = self._request.number_base, self._request.resume_after
         deadline_ns = monotonic_ns() + FIRST_FRAME_MS * NS_PER_MS
         while not self._stop.is_set():
+            if self._devices.removed.is_set():
+                raise Unplugged(f"camera {opened.serial} was unplugged")
             try:
-                reading = self._camera.read(READ_MS)
+                reading = stream.read(READ_S)
             except SourceEnded:
-                self._check_complete(last)
+                self._check_complete(stream.left_out_s, last)
                 if not self._request.loop:
                     raise
                 base += last
-                self._camera.rewind()
+                stream.rewind()
                 continue
             if reading is not None:
                 last = reading.camera_number
@@ -117,21 +120,23 @@ class Capture:
             elif monotonic_ns() > deadline_ns:
                 raise SourceError(f"camera {opened.serial} stopped sending frames")
             self._alive()
+        stream.stop()
 
     def _deliver(self, frames: SharedFrames, reading: Reading, number: int) -> None:
-        self._taken.clear()
         frames.write(reading.pixels, number, reading.camera_number, reading.captured_at_ns, reading.position_ns)
         link.offer(self._end, link.Delivered())
-        while self._request.lockstep and not self._stop.is_set() and not self._taken.wait(READ_MS / 1000):
-            # The reader may be busy for long; what was offered may have been lost.
-            link.offer(self._end, link.Delivered())
+        with self._taken:
+            while self._request.lockstep and self._taken_number < number and not self._stop.is_set():
+                # The reader may be busy for long; what was offered may have been lost.
+                if not self._taken.wait(READ_S):
+                    link.offer(self._end, link.Delivered())
 
-    def _check_complete(self, last: int) -> None:
+    def _check_complete(self, left_out_s: float, last: int) -> None:
         """The SDK ends a recording without a word where it cannot read on."""
-        if self._camera.left_out_s > CUT_SHORT_S:
+        if left_out_s > CUT_SHORT_S:
             raise RecordingBroken(
                 f"{self._request.recording}: cannot be read beyond frame {last}, "
-                f"{self._camera.left_out_s:.1f} s before its end; it may be damaged"
+                f"{left_out_s:.1f} s before its end; it may be damaged"
             )
 
     def _alive(self) -> None:
@@ -146,16 +151,18 @@ class Capture:
         """Hear what the other end says, and go when it is gone: even a main thread that hangs then goes along."""
         while (received := link.receive(self._end)) is not None:
             message, _ = received
-            if isinstance(message, link.Taken):
-                self._taken.set()
-            elif isinstance(message, link.Stop):
-                self._stop.set()
-                self._taken.set()
+            with self._taken:
+                if isinstance(message, link.Taken):
+                    self._taken_number = message.number
+                elif isinstance(message, link.Stop):
+                    self._stop.set()
+                self._taken.notify_all()
         os._exit(0)
 
 
-def serve(end: socket.socket, context: rs.context) -> None:
+def serve(end: socket.socket) -> None:
     """Do what the first message of the link asks for."""
+    context = rs.context()
     received = link.receive(end)
     request = received[0] if received is not None else None
     if isinstance(request, link.Survey):
@@ -164,7 +171,7 @@ def serve(end: socket.socket, context: rs.context) -> None:
         Capture(end, request, context).run()
 
 
-def main(descriptor: int, parent: int) -> NoReturn:
+def main(descriptor: int, parent: int, serve: Callable[[socket.socket], None] = serve) -> NoReturn:
     """Serve the link behind `descriptor`, for as long as the process `parent` lives."""
     # Whoever began this ends it, by the link; a Ctrl-C or a stop of the whole service is not for us to act on.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -176,7 +183,7 @@ def main(descriptor: int, parent: int) -> NoReturn:
         os._exit(0)
     try:
         link.send(end, link.Phase("booting"))
-        serve(end, rs.context())
+        serve(end)
         status = 0
     except (BrokenPipeError, ConnectionResetError):
         status = 0

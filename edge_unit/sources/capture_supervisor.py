@@ -138,15 +138,15 @@ class CaptureSupervisor:
         try:
             while True:
                 before = self.last_number
-                trouble = await self._capture(request)
-                if trouble is None:
+                failed = await self._capture(request)
+                if failed is None:
                     break
                 self._fruitless = 0 if self.last_number > before else self._fruitless + 1
-                if request.recording and self._fruitless >= FRUITLESS_MAX:
-                    raise SourceError(trouble)
-                restart = self._watchdog.end(monotonic_ns())
-                logger.warning("%s; capture begins anew in %g s", trouble, restart.delay_s)
-                self._board.post("restarting", trouble)
+                if failed.final or (request.recording and self._fruitless >= FRUITLESS_MAX):
+                    raise SourceError(failed.reason)
+                restart = self._watchdog.end(unplugged=failed.unplugged)
+                logger.warning("%s; capture begins anew in %g s", failed.reason, restart.delay_s)
+                self._board.post("restarting", failed.reason)
                 await asyncio.sleep(restart.delay_s)
                 request = replace(self._continued(), reset=restart.reset and not request.recording)
         except SourceError as error:
@@ -180,7 +180,7 @@ class CaptureSupervisor:
             number_base=taken.number - taken.camera_number,
         )
 
-    async def _capture(self, request: link.Request) -> str | None:
+    async def _capture(self, request: link.Request) -> link.Failed | None:
         """One process from begin to end; returns what went wrong, None when nothing is left to be done."""
         session = self._session = await CaptureSession.begin(request, self._command)
         looked_ns = monotonic_ns()
@@ -195,17 +195,15 @@ class CaptureSupervisor:
                         self._board.post("ended")
                         return None
                     if isinstance(message, link.Failed):
-                        if message.final:
-                            raise SourceError(message.reason)
-                        return message.reason
+                        return message
                     self._hear(message, session, now_ns)
                 self._look_for_frames(now_ns)
                 if session.gone:
-                    return f"the capture process was ended by {await session.ended()}"
+                    return link.Failed(f"the capture process was ended by {await session.ended()}")
                 if not late:
                     self._judge(now_ns)
                     if (stuck_s := self._watchdog.stuck_s(now_ns)) is not None:
-                        return f"the capture process hung for {stuck_s:.1f} s while {self._watchdog.phase}"
+                        return link.Failed(f"capture hung for {stuck_s:.1f} s while {self._watchdog.phase}")
         except asyncio.CancelledError:
             await session.stop()
             raise
@@ -268,7 +266,7 @@ class CaptureSupervisor:
 
     def _acknowledge(self) -> None:
         if self._request.lockstep and self._session is not None:
-            self._session.tell(link.Taken())
+            self._session.tell(link.Taken(self.last_number))
 
 
 def _identity(opened: link.Opened) -> link.Opened:

@@ -14,6 +14,11 @@ class Profile(NamedTuple):
     height: int
     fps: int
 
+    @property
+    def pixels(self) -> int:
+        """How many a picture has."""
+        return self.width * self.height
+
     def __str__(self) -> str:
         return f"{self.width}x{self.height} at {self.fps} fps"
 
@@ -24,12 +29,12 @@ def choose(wanted: Profile, offered: Iterable[Profile]) -> Profile | None:
     Where nothing comes so often (an old port, many cameras on a hub), the most frequent one, and of these the largest.
     None when nothing at all is offered. A rate counts for more than pixels: what moves is seen late otherwise.
     """
-    profiles = sorted(set(offered))
+    profiles = set(offered)
     if wanted in profiles:
         return wanted
-    area = wanted.width * wanted.height
-    fitting = [p for p in profiles if p.width * p.height <= area] or profiles
+    smallest = min((p.pixels for p in profiles), default=0)
+    fitting = [p for p in profiles if p.pixels <= max(wanted.pixels, smallest)]
     often = [p for p in fitting if p.fps >= wanted.fps]
     if often:
-        return max(often, key=lambda p: (p.width * p.height, -p.fps))
-    return max(fitting, key=lambda p: (p.fps, p.width * p.height), default=None)
+        return max(often, key=lambda p: (p.pixels, -p.fps, p.width))
+    return max(fitting, key=lambda p: (p.fps, p.pixels, p.width), default=None)

@@ -78,7 +78,7 @@ class RealsenseSourceConfig(BaseModel):
         return link.Request(
             stream=stream,
             serial=self.serial or "",
-            recording="" if self.recording is None else str(self.recording.absolute()),
+            recording="" if self.recording is None else str(self.recording),
             width=self.width,
             height=self.height,
             fps=self.fps,

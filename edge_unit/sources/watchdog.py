@@ -86,8 +86,10 @@ class Watchdog:
         quiet_ns = now_ns - self._frame_ns
         return quiet_ns / NS_PER_S if quiet_ns > max(SILENT_MIN_NS, SILENT_PERIODS * self._period_ns) else None
 
-    def end(self, now_ns: int) -> Restart:
-        """The process ended, though nobody wanted it to."""
+    def end(self, *, unplugged: bool = False) -> Restart:
+        """The process ended, though nobody wanted it to; when the camera was `unplugged`, nothing is wrong with it."""
+        if unplugged:
+            return Restart(BACK_OFF_S[0], reset=False)
         if self._streaming_ns is not None and self._frame_ns - self._streaming_ns >= STEADY_NS:
             self.failures = 0
         delay_s = BACK_OFF_S[min(self.failures, len(BACK_OFF_S) - 1)]

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process that writes a small recording for tests: `python write_recording.py PATH FRAMES [NAME=VALUE ...]`.
-
-Frame n of depth is n everywhere but for its first row, which counts columns; infrared and colour are n.
-"""
+"""The process that writes a small recording: PATH FRAMES [NAME=VALUE ...]."""
 
 from __future__ import annotations
 
@@ -13,34 +10,36 @@ from threading import Event
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edge_unit.sources.sdk_recorder import RecordedCamera, RecordedStream, SdkRecorder
 from shared.clock import NS_PER_S, monotonic_ns
-
-WIDTH, HEIGHT, FPS = 424, 240, 30
-
-
-def depth_of(number: int, width: int = WIDTH, height: int = HEIGHT) -> NDArray[np.uint16]:
-    """What frame `number` shows."""
-    depth = np.full((height, width), number, np.uint16)
-    depth[0] = np.arange(width)
-    return depth
+from tests.edge_unit.sources.recordings import (
+    BASELINE_M,
+    COLOR_AT_M,
+    CX,
+    CY,
+    DEPTH_SCALE_M,
+    FPS,
+    FX,
+    FY,
+    HEIGHT,
+    WIDTH,
+    depth_of,
+)
 
 
 def main(path: str, frames: str, *options: str) -> None:
-    """Write it."""
+    """Write it at the pace of a camera, for at that pace it is played."""
     given: dict[str, Any] = dict(option.split("=") for option in options)
-    width, height = int(given.get("width", WIDTH)), int(given.get("height", HEIGHT))
-    fps = int(given.get("fps", FPS))
-    lens = (fps, 212.5, 211.5, width / 2 + 0.25, height / 2 - 0.25)
-    streams = [RecordedStream("depth", width, height, *lens)]
-    if given.get("images"):
-        streams.append(RecordedStream("infrared", width, height, *lens))
-        streams.append(RecordedStream("color", width, height, *lens, stands_at_m=(0.015, 0.0, 0.001)))
-    camera = RecordedCamera(
-        given.get("serial", "SYN0001"), "Synthetic D435", 0.0005, 0.055, "5.16.0.1", given.get("usb", "3.2")
+    width, height, fps = (
+        int(given.get(name, usual)) for name, usual in (("width", WIDTH), ("height", HEIGHT), ("fps", FPS))
     )
+    streams = [RecordedStream("depth", width, height, fps, FX, FY, CX, CY)]
+    if given.get("images"):
+        streams.append(RecordedStream("infrared", width, height, fps, FX, FY, CX, CY))
+        streams.append(RecordedStream("color", width, height, fps, FX, FY, CX, CY, COLOR_AT_M))
+    serial, usb = given.get("serial", "SYN0001"), given.get("usb", "3.2")
+    camera = RecordedCamera(serial, "Synthetic D435", DEPTH_SCALE_M, BASELINE_M, "5.16.0.1", usb)
     recorder = SdkRecorder(Path(path), camera, streams)
     began_ns, pause = monotonic_ns(), Event()
     for number in range(1, int(frames) + 1):
@@ -55,4 +54,5 @@ def main(path: str, frames: str, *options: str) -> None:
 if __name__ == "__main__":
     main(*sys.argv[1:])
     sys.stdout.flush()
+    # The SDK's destructors are known to abort.
     os._exit(0)

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""RealSense cameras that can be plugged in and out, as file devices on the SDK's context.
+
+A file says which recordings are plugged in now, one path a line. This is the unit's capture process but for the
+socket into which they are plugged, so all that the unit does about a camera that comes and goes is done for real.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+import threading
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import pyrealsense2 as rs
+
+from edge_unit.sources import capture_link as link
+from edge_unit.sources.capture_process import Capture, main
+
+LOOK_EVERY_S = 0.02
+
+
+def command(sockets: Path) -> tuple[str, ...]:
+    """The capture command of a `RealsenseSource` whose cameras are those of the file `sockets`."""
+    return sys.executable, "-m", "simulation.pluggable", str(sockets)
+
+
+def plug(sockets: Path, recordings: Iterable[Path]) -> None:
+    """From now on these recordings are plugged in, and no other."""
+    written = sockets.with_suffix(".new")
+    written.write_text("".join(f"{recording}\n" for recording in recordings))
+    written.rename(sockets)
+
+
+def follow(sockets: Path, context: rs.context) -> None:
+    """Plug in and out as the file says, for ever."""
+    plugged: dict[str, object] = {}
+    pause = threading.Event()
+    while True:
+        wanted = sockets.read_text().split() if sockets.is_file() else []
+        for path in plugged.keys() - set(wanted):
+            context.unload_device(path)
+            del plugged[path]
+        for path in set(wanted) - plugged.keys():
+            # The SDK forgets a device that nobody holds.
+            plugged[path] = context.load_device(path)
+        pause.wait(LOOK_EVERY_S)
+
+
+def serve(end: socket.socket) -> None:
+    """Capture from whatever is plugged in; a camera does not end, so its recording begins again."""
+    received = link.receive(end)
+    if received is None or not isinstance(received[0], link.Request):
+        return
+    context = rs.context()
+    capture = Capture(end, replace(received[0], loop=True), context)
+    threading.Thread(target=follow, args=(Path(sys.argv[1]), context), name="sockets", daemon=True).start()
+    capture.run()
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[2]), int(sys.argv[3]), serve)

@@ -60,10 +60,10 @@ class FilterSettings(BaseModel):
         default=0.12, ge=0.01, le=1.0, description="Standard deviation of the camera's disparity, in pixels."
     )
     reference_margin_base_m: float = Field(
-        default=0.05, ge=0.0, le=0.5, description="Constant part of the margin before learned surfaces, in metres."
+        default=0.03, ge=0.0, le=0.5, description="Constant part of the margin before learned surfaces, in metres."
     )
     reference_spread_gain: float = Field(
-        default=7.5, ge=0.0, le=20.0, description="Standard deviations of a learned pixel in its margin."
+        default=3.25, ge=0.0, le=20.0, description="Standard deviations of a learned pixel in its margin."
     )
     edge_radius_px: int = Field(
         default=6,

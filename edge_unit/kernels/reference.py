@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from edge_unit.kernels.jit import kernel
 from edge_unit.kernels.limits import RAW_MAX
 
+TAIL_SIGMAS = 4.0
+"""Margins are some four spreads."""
+
 MODES = 4
 """A pixel at an edge shows two surfaces and the flying depths between; one more for who walks past."""
 
@@ -75,6 +78,17 @@ def observe(
 
 
 @kernel
+def students_excess(freedom: float) -> float:
+    """By how much few samples widen a spread that is multiplied by some four: Student's quantile over the normal one.
+
+    Two terms of Fisher's expansion, at four standard deviations.
+    """
+    q2 = TAIL_SIGMAS * TAIL_SIGMAS
+    first = (q2 + 1.0) / (4.0 * freedom)
+    return 1.0 + first + (5.0 * q2 * q2 + 16.0 * q2 + 3.0) / (96.0 * freedom * freedom)
+
+
+@kernel
 def conclude(
     looks: NDArray[np.uint16],
     numbers: NDArray[np.uint16],
@@ -89,7 +103,8 @@ def conclude(
     """The nearest mode that holds at least `share_min` of a pixel's looks, and its standard deviation.
 
     The spread is drawn towards the camera's model `noise * z**2` as if `prior_weight` frames had shown it, for the
-    spread of few frames is no measure. `reference_m`, `spread_m` (H, W) are NaN where nothing was learned.
+    spread of few frames is no measure, and widened as Student's t has it. `reference_m`, `spread_m` (H, W) are NaN
+    where nothing was learned.
     """
     height, width = reference_m.shape
     for y in range(height):
@@ -107,4 +122,5 @@ def conclude(
             model = prior_noise_per_m * z * z
             squares = squares_m2[y, x, best] + prior_weight * model * model
             reference_m[y, x] = z
-            spread_m[y, x] = math.sqrt(squares / (prior_weight + numbers[y, x, best] - 1.0))
+            freedom = prior_weight + numbers[y, x, best] - 1.0
+            spread_m[y, x] = math.sqrt(squares / freedom) * students_excess(freedom)

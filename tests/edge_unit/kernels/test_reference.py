@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import stats
 
-from edge_unit.kernels.reference import MODES, conclude, observe
+from edge_unit.kernels.reference import MODES, conclude, observe, students_excess
 
 RAW_MAX = 65535
 SCALE_M, RANGE_MAX_M, BASE_M, NOISE_PER_M = 0.001, 6.0, 0.03, 0.02
@@ -70,7 +71,8 @@ class PixelTwin:
         best = min(credible, key=lambda mode: float(np.mean(mode)))
         z = float(np.mean(best))
         squares = len(best) * np.var(best) + PRIOR_WEIGHT * (PRIOR_NOISE_PER_M * z * z) ** 2
-        return z, float(np.sqrt(squares / (PRIOR_WEIGHT + len(best) - 1)))
+        freedom = PRIOR_WEIGHT + len(best) - 1
+        return z, float(np.sqrt(squares / freedom)) * students_excess(freedom)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -159,11 +161,17 @@ def test_what_is_seen_past_the_robot_is_learned() -> None:
 def test_few_frames_have_the_cameras_own_spread() -> None:
     learner = Learner((1, 1))
     learner.add(constant(2000))
-    assert learner.conclude()[1][0, 0] == pytest.approx(PRIOR_NOISE_PER_M * 4.0)
+    assert learner.conclude()[1][0, 0] == pytest.approx(PRIOR_NOISE_PER_M * 4.0 * students_excess(PRIOR_WEIGHT))
     rng = np.random.default_rng(0)
     for _ in range(400):
         learner.add(constant(2000 + round(rng.normal(0.0, 12.0))))
     assert learner.conclude()[1][0, 0] == pytest.approx(0.012, rel=0.1)
+
+
+@pytest.mark.parametrize("freedom", [9.0, 20.0, 63.0, 1000.0])
+def test_few_frames_widen_the_spread_as_students_t_has_it(freedom: float) -> None:
+    beyond = stats.norm.sf(4.0)
+    assert students_excess(freedom) == pytest.approx(stats.t.isf(beyond, freedom) / 4.0, rel=0.1)
 
 
 def test_a_count_stays_at_its_end() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.kernels.jit import kernel
-from edge_unit.kernels.limits import RAW_MAX
+from edge_unit.kernels.limits import RAW_MAX, less_noise
 
 STEP_SHARE = 0.5
 """A step of half a margin is an edge: beyond a smaller one the margin behind it holds the halo, too."""
@@ -93,7 +93,7 @@ def halo_bands(
             if w == 0.0:
                 continue
             z_near, z_far = 1.0 / w, 1.0 / farthest_w[y, x]
-            low = math.floor((z_near - (base_m + noise_per_m * z_near * z_near)) / depth_scale_m)
+            low = math.floor((less_noise(z_near, noise_per_m * z_near * z_near) - base_m) / depth_scale_m)
             high = math.ceil((z_far + (base_m + noise_per_m * z_far * z_far)) / depth_scale_m)
             low, high = min(max(low, 0), RAW_MAX), min(max(high, 0), RAW_MAX)
             pixels[number] = y * width + x

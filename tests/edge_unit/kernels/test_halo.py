@@ -1,124 +1,106 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from edge_unit.kernels.halo import STEP_SHARE, drop_halo, halo_bands, spread_edges
+from edge_unit.kernels.halo import drop_halo, halo_bands, spread_edges
 
+SHAPE = (31, 47)
+FX, FY = 60.0, 70.0
+BASE_M, NOISE_PER_M, SCALE_M = 0.03, 0.02, 0.001
 RAW_MAX = 65535
-FX, FY = 40.0, 38.0
-BASE_M, NOISE_PER_M = 0.03, 0.02
-Image = NDArray[np.float32]
 
 
-def spread(w: Image, padding_m: float) -> tuple[int, Image, Image]:
-    nearest, farthest = np.full_like(w, 7), np.full_like(w, 7)
-    number = spread_edges(w, padding_m, BASE_M, NOISE_PER_M, FX, FY, nearest, farthest)
-    assert number == np.count_nonzero(nearest)
-    assert ((nearest > 0) == (farthest > 0)).all()
-    return number, nearest, farthest
+def bands(w: NDArray[np.float32], padding_m: float) -> tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.uint16]]:
+    nearest_w, farthest_w = np.full((2, *w.shape), 7.0, np.float32)
+    number = spread_edges(w, padding_m, BASE_M, NOISE_PER_M, FX, FY, nearest_w, farthest_w)
+    assert number == np.count_nonzero(nearest_w)
+    pixels = np.empty(number, np.int32)
+    near_raw, span_raw = np.empty((2, number), np.uint16)
+    halo_bands(nearest_w, farthest_w, BASE_M, NOISE_PER_M, SCALE_M, pixels, near_raw, span_raw)
+    return pixels, near_raw, span_raw
 
 
-def spread_twin(w: Image, padding_m: float) -> tuple[Image, Image]:
-    """Each edge pixel paints its ellipse over all that lies behind it."""
-    nearest, farthest = np.zeros_like(w), np.full_like(w, np.inf)
-    v, u = np.mgrid[0 : w.shape[0], 0 : w.shape[1]]
-    around = np.pad(w, 1, mode="edge")
-    lowest = np.min((around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:]), axis=0)
-    for y, x in np.argwhere(w > 0):
-        own = w[y, x]
-        z = 1.0 / np.float64(own)
-        behind = np.float32(1.0 / (z + STEP_SHARE * (BASE_M + NOISE_PER_M * z * z)))
-        if not lowest[y, x] < behind:
+def twin(w: NDArray[np.float32], padding_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Depth of the nearest and of the farthest edge that reaches over each pixel, NaN where none does."""
+    height, width = w.shape
+    with np.errstate(divide="ignore"):
+        z = np.where(w > 0, 1.0 / w.astype(np.float64), np.inf)
+    nearest, farthest = np.full((2, height, width), np.nan)
+    v, u = np.mgrid[0:height, 0:width]
+    bordered = np.pad(z, 1, mode="edge")
+    around = np.stack((bordered[1:-1, :-2], bordered[1:-1, 2:], bordered[:-2, 1:-1], bordered[2:, 1:-1])).max(axis=0)
+    for row, column in np.argwhere(np.isfinite(z)):
+        depth = z[row, column]
+        behind = depth + 0.5 * (BASE_M + NOISE_PER_M * depth**2)
+        if not around[row, column] > behind:
             continue
-        rows, columns = padding_m * FY * own, padding_m * FX * own
-        down, across = np.abs(v - y), np.abs(u - x)
-        share = np.minimum(down / rows, 1.0) if rows > 0 else np.zeros(w.shape)
-        reached = (down <= math.floor(rows)) & (across <= np.floor(columns * np.sqrt(1.0 - share**2))) & (w < behind)
-        nearest[reached] = np.maximum(nearest[reached], own)
-        farthest[reached] = np.minimum(farthest[reached], own)
-    return nearest, np.where(np.isinf(farthest), 0, farthest).astype(np.float32)
+        offset_m = np.hypot((u - column) / FX, (v - row) / FY) * depth
+        reached = (offset_m <= padding_m) & (z > behind)
+        nearest[reached] = np.fmin(nearest[reached], depth)
+        farthest[reached] = np.fmax(farthest[reached], depth)
+    return nearest, farthest
 
 
-def patches(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
-    """Surfaces before one another, some of them at the picture's edge, and pixels where nothing is known."""
-    w = np.zeros(shape, np.float32)
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("padding_m", [0.0, 0.0513, 0.21])
+def test_finds_what_the_twin_finds(seed: int, padding_m: float) -> None:
+    rng = np.random.default_rng(seed)
+    z = np.full(SHAPE, np.inf)
     for _ in range(6):
-        top, left = rng.integers(-5, shape[0]), rng.integers(-5, shape[1])
-        patch = w[max(top, 0) : top + rng.integers(1, 20), max(left, 0) : left + rng.integers(1, 20)]
-        np.maximum(patch, np.float32(1.0 / rng.uniform(0.3, 4.0)), out=patch)
+        row, column = rng.integers(0, SHAPE[0]), rng.integers(0, SHAPE[1])
+        patch = z[row : row + rng.integers(1, 15), column : column + rng.integers(1, 20)]
+        np.minimum(patch, rng.uniform(0.4, 3.0), out=patch)
+    w = (1.0 / z).astype(np.float32)
+    nearest, farthest = twin(w, padding_m)
+    pixels, near_raw, span_raw = bands(w, padding_m)
+    assert np.array_equal(pixels, np.flatnonzero(np.isfinite(nearest)))
+    low = nearest.ravel()[pixels]
+    low_m = low * low / (low + NOISE_PER_M * low**2) - BASE_M
+    high = farthest.ravel()[pixels]
+    high_m = high + BASE_M + NOISE_PER_M * high**2
+    np.testing.assert_allclose(near_raw * SCALE_M, low_m, atol=0.0011)
+    np.testing.assert_allclose((near_raw.astype(float) + span_raw) * SCALE_M, high_m, atol=0.0011)
+    assert padding_m == 0.0 or len(pixels) > 10
+
+
+def edge(near_m: float, far_m: float) -> NDArray[np.float32]:
+    w = np.full(SHAPE, 1.0 / far_m if np.isfinite(far_m) else 0.0, np.float32)
+    w[:, :20] = 1.0 / near_m
     return w
 
 
-@pytest.mark.parametrize("padding_m", [0.0, 0.05, 0.3])
-@pytest.mark.parametrize("shape", [(41, 61), (1, 30), (30, 1), (1, 1)])
-def test_edges_reach_what_the_twins_reach(padding_m: float, shape: tuple[int, int]) -> None:
-    rng = np.random.default_rng(3)
-    for _ in range(4):
-        w = patches(rng, shape)
-        nearest, farthest = spread_twin(w, padding_m)
-        assert (spread(w, padding_m)[1] == nearest).all()
-        assert (spread(w, padding_m)[2] == farthest).all()
+@pytest.mark.parametrize("far_m", [2.0, np.inf])
+def test_an_edge_reaches_its_padding_and_no_farther(far_m: float) -> None:
+    pixels, _, _ = bands(edge(1.0, far_m), 0.1)
+    assert sorted(set((pixels % SHAPE[1]).tolist())) == list(range(20, 26))  # 0.1 m at 1 m and 60 px: 6 px
+    assert len(pixels) == 6 * SHAPE[0]
 
 
-def test_without_surfaces_and_without_steps_there_is_no_halo() -> None:
-    assert spread(np.zeros((9, 11), np.float32), 0.05)[0] == 0
-    assert spread(np.full((9, 11), 0.7, np.float32), 0.05)[0] == 0
-    # A floor that recedes has no edge, however steep it looks.
-    slope = np.linspace(0.9, 0.5, 60, dtype=np.float32)[:, None].repeat(11, axis=1)
-    assert spread(slope, 0.05)[0] == 0
+def test_a_small_step_is_no_edge() -> None:
+    assert len(bands(edge(1.0, 1.02), 0.1)[0]) == 0
+    assert len(bands(edge(1.0, 1.03), 0.1)[0]) > 0
 
 
-def test_an_edge_reaches_its_padding_over_what_lies_behind() -> None:
-    w = np.full((41, 61), 0.5, np.float32)
-    w[:, :30] = 1.0
-    _, nearest, _ = spread(w, 0.1)  # 4 px at 1 m
-    assert (nearest[:, 30:34] == 1.0).all()
-    assert not nearest[:, 34:].any()
-    assert not nearest[:, :30].any(), "what stands before an edge is not touched by it"
+def test_a_plane_at_a_slant_has_no_edge() -> None:
+    w = np.broadcast_to(np.linspace(0.5, 0.6, SHAPE[1], dtype=np.float32), SHAPE).copy()
+    assert len(bands(w, 0.1)[0]) == 0
 
 
-@pytest.mark.parametrize("scale_m", [0.001, 0.0001])
-def test_bands_are_the_edges_depths_with_their_margins(scale_m: float) -> None:
-    rng = np.random.default_rng(0)
-    number, nearest, farthest = spread(patches(rng, (41, 61)), 0.2)
-    pixels = np.full(number, -1, np.int32)
-    near_raw, span_raw = np.zeros(number, np.uint16), np.zeros(number, np.uint16)
-    halo_bands(nearest, farthest, BASE_M, NOISE_PER_M, scale_m, pixels, near_raw, span_raw)
-    assert (pixels == np.flatnonzero(nearest)).all()
-    z_near, z_far = (1.0 / image[nearest > 0].astype(np.float64) for image in (nearest, farthest))
-    low = np.clip(np.floor((z_near - BASE_M - NOISE_PER_M * z_near**2) / scale_m), 0, RAW_MAX)
-    high = np.clip(np.ceil((z_far + BASE_M + NOISE_PER_M * z_far**2) / scale_m), 0, RAW_MAX)
-    assert np.abs(near_raw - low).max() <= 1
-    assert np.abs(near_raw.astype(float) + span_raw - high).max() <= 1
+def test_an_edge_that_fills_the_picture_and_one_beyond_raw_depth() -> None:
+    pixels, near_raw, span_raw = bands(edge(0.051, 1.0), 5.0)
+    assert len(pixels) == SHAPE[0] * (SHAPE[1] - 20)
+    assert (near_raw == 20).all()
+    _, near_raw, span_raw = bands(edge(64.0, 90.0), 30.0)
+    assert (near_raw.astype(int) + span_raw == RAW_MAX).all()
 
 
-@pytest.mark.parametrize("width", [1, 8, 61])
-def test_what_lies_in_its_band_is_dropped(width: int) -> None:
-    rng = np.random.default_rng(width)
-    shape = (23, width)
-    edges = np.array([0, 1, 999, 1000, 1001, 65534, 65535], np.uint16)
-    depth = rng.choice(edges, shape)
-    pixels = np.flatnonzero(rng.random(shape) < 0.5).astype(np.int32)
-    near = rng.choice(edges, len(pixels))
-    high = np.maximum(near, rng.choice(edges, len(pixels)))
-    mask = np.zeros((23, -(-width // 8) * 8), np.uint8)
-    mask[:, :width] = rng.random(shape) < 0.8
-    wanted = mask.copy()
-    for pixel, low, end in zip(pixels.tolist(), near.tolist(), high.tolist(), strict=True):
-        y, x = divmod(pixel, width)
-        if low <= depth[y, x] <= end:
-            wanted[y, x] = 0
-    drop_halo(depth, pixels, near, high - near, mask)
-    assert (mask == wanted).all()
-
-
-def test_without_a_halo_nothing_is_dropped() -> None:
-    mask = np.ones((3, 8), np.uint8)
-    nothing = np.empty(0, np.uint16)
-    drop_halo(np.full((3, 5), 1000, np.uint16), np.empty(0, np.int32), nothing, nothing, mask)
-    assert mask.all()
+def test_only_what_lies_in_the_band_is_dropped() -> None:
+    depth = np.array([[0, 900, 950, 1000, 1050, 1051, RAW_MAX, 1000]], np.uint16)
+    mask = np.ones((1, 16), np.uint8)
+    mask[0, 7] = 0
+    pixels = np.arange(7, dtype=np.int32)
+    drop_halo(depth, pixels, np.full(7, 950, np.uint16), np.full(7, 100, np.uint16), mask)
+    assert mask[0].tolist() == [1, 1, 0, 0, 0, 1, 1, 0] + [1] * 8

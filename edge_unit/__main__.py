@@ -9,13 +9,15 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
 from pathlib import Path
 
 from edge_unit.config import ENVIRONMENT_PREFIX, UnitConfig
 from edge_unit.jit_cache import settle
 from shared.configuration import assignments, load
 from shared.errors import CellwatchError
+
+logger = logging.getLogger("edge_unit")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -30,25 +32,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         config.read_token()
         if config.jit_cache_dir is not None:
             settle(config.jit_cache_dir)
-        asyncio.run(_run(config))
+        # Imported only now, for kernels settle where they are kept when they are imported.
+        from edge_unit.unit import Unit, make_source
+
+        asyncio.run(_until_told_to_stop(Unit(config, make_source(config.source)).run()))
     except CellwatchError as error:
         print(f"edge-unit: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-async def _run(config: UnitConfig) -> None:
-    # Imported only now, for kernels settle where they are kept when they are imported.
-    from edge_unit.unit import Unit, make_source
-
-    unit = asyncio.ensure_future(Unit(config, make_source(config.source)).run())
+async def _until_told_to_stop(work: Coroutine[None, None, None]) -> None:
+    """Run to the end, or to a signal."""
+    task = asyncio.ensure_future(work)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, unit.cancel)
+        loop.add_signal_handler(number, task.cancel)
     try:
-        await unit
+        await task
     except asyncio.CancelledError:
-        logging.getLogger(__name__).info("stopped")
+        logger.info("stopped")
 
 
 def _parser() -> argparse.ArgumentParser:

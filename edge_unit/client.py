@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any
 from urllib.parse import urlsplit
@@ -36,6 +36,8 @@ MAX_MESH_BYTES = 128 * 2**20
 LIMITS = httpx.Limits(max_connections=4, max_keepalive_connections=4, keepalive_expiry=60.0)
 """Update, joints, cell and pose may each be under way."""
 
+MSGPACK_BOTH_WAYS = {"Content-Type": MEDIA_TYPE, "Accept": MEDIA_TYPE}
+
 ERROR_CHARS = 300
 """Of the master's reason."""
 
@@ -43,8 +45,17 @@ ERROR_CHARS = 300
 class MasterClient:
     """A connection to one master, kept open between calls."""
 
-    def __init__(self, url: str, read_token: Callable[[], str], source_address: str | None = None) -> None:
-        """`read_token` is asked when a connection is authorised anew; `source_address` is an own IP to connect from."""
+    def __init__(
+        self,
+        url: str,
+        read_token: Callable[[], str],
+        source_address: str | None = None,
+        transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        """`read_token` is asked at each registration; `source_address` is an own IP to connect from.
+
+        `transport` carries the requests in place of a network.
+        """
         self.url = url.rstrip("/")
         self._read_token = read_token
         parts = urlsplit(self.url)
@@ -52,13 +63,14 @@ class MasterClient:
             raise ConfigError(f"master_url: expected http://host:port, got {url}")
         self._http = httpx.AsyncClient(
             base_url=self.url,
-            transport=httpx.AsyncHTTPTransport(local_address=source_address, limits=LIMITS),
+            transport=transport or httpx.AsyncHTTPTransport(local_address=source_address, limits=LIMITS),
             timeout=TIMEOUT,
             # No proxy from the environment: the master is on our own network.
             trust_env=False,
         )
-        # What httpx adds by itself costs bytes in every update and tells the master nothing.
-        self._http.headers = httpx.Headers({"Accept": MEDIA_TYPE})
+        # They would cost a hundred bytes in every update and tell the master nothing.
+        for name in ("Accept", "Accept-Encoding", "Connection", "User-Agent"):
+            del self._http.headers[name]
 
     async def __aenter__(self) -> MasterClient:
         await self.authorize()
@@ -90,7 +102,8 @@ class MasterClient:
             MasterRefused: the master said no; `status` tells how.
             WireError: the answer is none of ours.
         """
-        return decode_update_answer(await self._call("POST", "/update", encode_update(update)))
+        headers = {"Content-Type": MEDIA_TYPE}
+        return decode_update_answer(await self._call("POST", "/update", encode_update(update), headers))
 
     async def robot(self, since_ns: int, timeout_s: float) -> RobotAnswer:
         """Joints after `since_ns` by the master's clock. Raises as `update`."""
@@ -119,10 +132,10 @@ class MasterClient:
         method: str,
         path: str,
         body: bytes | None = None,
+        headers: Mapping[str, str] = MSGPACK_BOTH_WAYS,
         timeout: httpx.Timeout | float = TIMEOUT,
         limit: int = MAX_ANSWER_BYTES,
     ) -> bytes:
-        headers = {"Content-Type": MEDIA_TYPE} if body is not None else None
         received = bytearray()
         try:
             async with self._http.stream(method, path, content=body, headers=headers, timeout=timeout) as response:

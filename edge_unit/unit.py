@@ -63,11 +63,15 @@ class _Learning:
 class Unit:
     """One camera, one master; `run` until cancelled or until a recording ends."""
 
-    def __init__(self, config: UnitConfig, source: DepthSource) -> None:
-        """Raises ConfigError when the trace cannot be written or the pose cannot be read."""
+    def __init__(self, config: UnitConfig, source: DepthSource, client: MasterClient | None = None) -> None:
+        """Reads and opens files, so make it before the event loop runs.
+
+        Raises:
+            ConfigError: the trace cannot be written, or the configured pose cannot be read.
+        """
         self._config = config
         self._source = source
-        self._client = MasterClient(config.master_url, config.read_token, config.source_address)
+        self._client = client or MasterClient(config.master_url, config.read_token, config.source_address)
         configured = config.T_world_camera
         self._pose = None if configured is None else (configured.transform(), "configured")
         self._store = BackgroundStore(config.state_dir)

@@ -1,0 +1,364 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The daemon with a real pipeline and a real master, both in this process, and a camera that shows what we want."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from edge_unit import unit as unit_module
+from edge_unit import uplink as uplink_module
+from edge_unit.client import MasterClient
+from edge_unit.config import PoseConfig, UnitConfig
+from edge_unit.sources.frame import CameraInfo, DepthFrame
+from edge_unit.sources.simulated import SimulatedSourceConfig
+from edge_unit.trace import read_trace
+from edge_unit.unit import Unit
+from master_server.access import Access
+from master_server.app import make_app
+from master_server.master import Master
+from shared.camera import Intrinsics
+from shared.clock import monotonic_ns
+from shared.errors import SourceError
+from shared.messages import JointsRequest, UnitRow
+from tests.master_server.fakes import master as make_master
+
+TOKEN = "unit-token-0123456789"
+IP = "10.0.0.1"
+# So few pixels with the noise of a real camera: its imagers stand a metre apart.
+CAMERA = Intrinsics(64, 48, 60.0, 60.0, 31.5, 23.5, stereo_baseline_m=1.0)
+FAR_MM = 5000
+
+# Above the box of 1 m, 2 m, 0.5 m, looking straight down at its middle.
+ABOVE = PoseConfig(xyz=(0.5, 1.0, 1.5), rpy_deg=(180.0, 0.0, 0.0))
+BESIDE = PoseConfig(xyz=(0.5, 1.5, 1.5), rpy_deg=(180.0, 0.0, 0.0))
+
+
+def patch(depth_mm: int, column: int = 24) -> NDArray[np.uint16]:
+    """A square of 16 pixels before a floor that is far outside the cell."""
+    depth = np.full(CAMERA.shape, FAR_MM, np.uint16)
+    depth[16:32, column : column + 16] = depth_mm
+    return depth
+
+
+class FakeSource:
+    """Delivers what a test puts into it; an exception is raised, None is the end."""
+
+    def __init__(self) -> None:
+        self.queue: asyncio.Queue[NDArray[np.uint16] | Exception | None] = asyncio.Queue()
+        self.serial = "A"
+        self.opened = 0
+        self.closed = 0
+        self.number = 0
+        self.joints: NDArray[np.float64] | None = None
+
+    async def open(self) -> CameraInfo:
+        self.opened += 1
+        return CameraInfo(self.serial, "fake", CAMERA)
+
+    async def frames(self) -> AsyncIterator[DepthFrame]:
+        while True:
+            item = await self.queue.get()
+            if item is None:
+                return
+            if isinstance(item, Exception):
+                raise item
+            yield DepthFrame(item, monotonic_ns(), self.number, self.joints)
+            self.number += 1
+
+    async def close(self) -> None:
+        self.closed += 1
+
+
+class Bench:
+    """One master, one unit, one source."""
+
+    def __init__(self, folder: Path, with_robot: bool = False, **config: Any) -> None:
+        self.source = FakeSource()
+        self.serve(make_master(with_robot, stale_after_s=60.0))
+        fields = {"T_world_camera": ABOVE, "state_dir": folder, "token": TOKEN, **config}
+        # Which source is configured decides only what happens when it fails.
+        self.config = UnitConfig(source=SimulatedSourceConfig(), **fields)
+        self.unit = self.make_unit()
+
+    def serve(self, master: Master) -> None:
+        """From now on this master answers."""
+        self.master = master
+        self.app = make_app(master, Access(TOKEN.encode(), b"operator-token-0123456789"))
+
+    def make_unit(self) -> Unit:
+        transport = httpx.ASGITransport(app=lambda *call: self.app(*call), client=(IP, 40_000))
+        client = MasterClient("http://master", lambda: TOKEN, transport=transport)
+        return Unit(self.config, self.source, client)
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator[asyncio.Task[None]]:
+        task = asyncio.create_task(self.unit.run())
+        try:
+            yield task
+        finally:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+
+    def show(self, depth: NDArray[np.uint16] | Exception | None) -> None:
+        self.source.queue.put_nowait(depth)
+
+    def row(self) -> UnitRow | None:
+        rows = self.master.units(monotonic_ns())
+        return rows[0] if rows else None
+
+    def voxels(self) -> set[tuple[int, ...]]:
+        view = self.master.view(monotonic_ns())
+        return {tuple(index) for index in view.lattice.indices(view.keys).tolist()}
+
+    async def until(self, look: Callable[[], Any], what: str, timeout_s: float = 20.0) -> Any:
+        deadline_ns = monotonic_ns() + round(timeout_s * 1e9)
+        while not (found := look()):
+            assert monotonic_ns() < deadline_ns, f"{what}: {self.row()}"
+            await asyncio.sleep(0.002)
+        return found
+
+    async def until_state(self, state: str) -> UnitRow:
+        found = await self.until(lambda: (row := self.row()) is not None and row.state == state and row, state)
+        assert isinstance(found, UnitRow)
+        return found
+
+
+async def test_from_frame_to_map(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path)
+    async with bench.running():
+        bench.show(patch(1225))
+        row = await bench.until_state("live")
+        # 1.225 m below the camera, in the middle: 0.33 m wide.
+        assert {index[2] for index in bench.voxels()} == {5}
+        assert 36 <= len(bench.voxels()) <= 64
+        assert row.voxels == len(bench.voxels())
+        assert row.health.valid_share == 1.0
+        assert row.process_ms > 0.0
+        assert bench.master.view(monotonic_ns()).complete
+        bench.show(patch(FAR_MM))
+        await bench.until(lambda: not bench.voxels(), "an empty map")
+        assert bench.master.view(monotonic_ns()).complete
+    assert bench.source.closed >= 1
+
+
+async def test_what_is_seen_goes_along_only_when_it_changed(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path)
+    reports = []
+    update = MasterClient.update
+
+    async def spy(client: MasterClient, request: Any) -> Any:
+        reports.append((request.health.frame, request.seen is not None))
+        return await update(client, request)
+
+    with pytest.MonkeyPatch.context() as monkey:
+        monkey.setattr(MasterClient, "update", spy)
+        async with bench.running():
+            for number, depth in enumerate((patch(FAR_MM), patch(FAR_MM), patch(1225), patch(1225))):
+                bench.show(depth)
+                await bench.until(lambda number=number: (number, False) in reports or (number, True) in reports, "sent")
+    assert [seen for frame, seen in reports if frame in (0, 2)][:1] == [True]
+    changed = [frame for frame, seen in reports if seen]
+    assert changed == [0, 2]
+
+
+async def test_settings_cell_and_pose_change_while_it_runs(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path)
+    async with bench.running() as task:
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        before = bench.voxels()
+        bench.master.change_settings({"voxel_size_m": 0.1})
+        assert bench.voxels() == set()
+        await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        coarse = bench.voxels()
+        assert 0 < len(coarse) < len(before)
+        assert {index[2] for index in coarse} == {2}
+
+        bench.master.set_pose(1, _matrix(BESIDE), "operator", None)
+        await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        assert {(x, y + 5, z) for x, y, z in coarse} == bench.voxels()
+        assert not task.done()
+
+
+def _matrix(pose: PoseConfig) -> Any:
+    return tuple(tuple(row) for row in pose.transform().tolist())
+
+
+async def test_without_a_pose_it_waits_for_one(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path, T_world_camera=None)
+    async with bench.running():
+        bench.show(patch(1225))
+        await bench.until(lambda: (row := bench.row()) and row.age_s is not None, "a frame of an uncalibrated unit")
+        await bench.until_state("uncalibrated")
+        assert bench.voxels() == set()
+        bench.master.set_pose(1, _matrix(ABOVE), "operator", None)
+        await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        assert bench.voxels()
+
+
+async def test_a_camera_that_fails_is_opened_again_and_its_trouble_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(unit_module, "REOPEN_MIN_S", 0.3)
+    bench = await asyncio.to_thread(Bench, tmp_path)
+    async with bench.running():
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        bench.show(SourceError("unplugged"))
+        row = await bench.until_state("blind")
+        assert row.reason == "camera: unplugged"
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        assert bench.source.opened == 2
+
+
+async def test_another_camera_registers_anew_and_its_pose_is_void(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path)
+    async with bench.running():
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        bench.config = bench.config.model_copy(update={"T_world_camera": None})
+        bench.unit._pose = None
+        bench.source.serial = "B"
+        bench.show(SourceError("unplugged"))
+        row = await bench.until_state("uncalibrated")
+        assert row.serial == "B"
+        assert "changed from A to B" in row.reason
+
+
+async def test_a_forgotten_unit_comes_back(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path)
+    async with bench.running():
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        bench.master.forget(1)
+        bench.show(patch(1225))
+        row = await bench.until(lambda: (row := bench.row()) and row.arrival_age_s is not None and row, "registered")
+        assert row.id == 2
+        bench.show(patch(1225))
+        await bench.until_state("live")
+
+
+async def test_another_master_never_gets_voxels_of_the_first_ones_lattice(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path)
+    async with bench.running():
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        # All version numbers begin at 1 again, and mean another lattice.
+        bench.serve(make_master(voxel_size_m=0.1, stale_after_s=60.0))
+        await bench.until(bench.row, "registered")
+        await asyncio.sleep(3.0 * uplink_module.HEARTBEAT_S)
+        assert bench.voxels() == set()
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        assert {index[2] for index in bench.voxels()} == {2}
+
+
+async def test_joints_of_the_frames_time_reach_the_pipeline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path, with_robot=True)
+    used: list[Any] = []
+    process = unit_module._report
+
+    def spy(pipeline: Any, assignment: Any, frame: Any, joints: Any) -> Any:
+        used.append(joints)
+        return process(pipeline, assignment, frame, joints)
+
+    monkeypatch.setattr(unit_module, "_report", spy)
+    async with bench.running():
+        bench.show(patch(FAR_MM))
+        await bench.until(lambda: used, "a frame without joints")
+        assert used[-1] is None
+        for step in range(3):
+            bench.master.put_joints(JointsRequest(positions=(0.5, 0.1 * step)), monotonic_ns())
+            await asyncio.sleep(0.01)
+        bench.show(patch(FAR_MM))
+        await bench.until(lambda: len(used) == 2, "a frame with joints")
+        assert used[-1].positions[0] == pytest.approx(0.5)
+        assert used[-1].uncertainty[0] == 0.0
+        assert used[-1].uncertainty[1] > 0.0
+        bench.source.joints = np.array([0.25, -0.25])
+        bench.show(patch(FAR_MM))
+        await bench.until(lambda: len(used) == 3, "a frame with joints of its own")
+        assert used[-1].positions.tolist() == [0.25, -0.25]
+
+
+async def test_joints_that_do_not_fit_are_a_trouble_and_no_end(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path, with_robot=True)
+    bench.source.joints = np.zeros(3)
+    async with bench.running():
+        bench.show(patch(1225))
+        row = await bench.until_state("blind")
+        assert "2 finite positions" in row.reason
+        bench.source.joints = np.zeros(2)
+        bench.show(patch(1225))
+        await bench.until_state("live")
+
+
+async def test_the_background_is_learned_kept_and_used_again(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path, learn_background_frames=4)
+    async with bench.running():
+        for _ in range(3):
+            bench.show(patch(1225))
+        row = await bench.until(lambda: (row := bench.row()) and row.frame_number == 2 and row, "learning")
+        assert row.state == "blind"
+        assert row.reason == "learning the background: frame 3 of 4"
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        assert bench.voxels() == set()
+        bench.show(patch(1100))
+        await bench.until(bench.voxels, "something before the background")
+    # Started again, it knows the background from disk.
+    bench.unit = await asyncio.to_thread(bench.make_unit)
+    async with bench.running():
+        bench.show(patch(1225))
+        await bench.until(lambda: (row := bench.row()) and row.frame_number == 5, "the next frame")
+        assert bench.voxels() == set()
+        command = bench.master.ask(1, "drop_background")
+        await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
+        bench.show(patch(1225))
+        await bench.until(bench.voxels, "no background")
+        await bench.until(lambda: not bench.master.registry.get(1).commands, f"{command} done")
+
+
+async def test_frames_beyond_the_rate_are_passed_over(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path, fps_max=1.0, trace_path=tmp_path / "trace")
+    async with bench.running():
+        for _ in range(5):
+            bench.show(patch(1225))
+        bench.show(None)
+        await asyncio.sleep(0.0)
+        await bench.until_state("live")
+    assert [record.frame_number for record in await asyncio.to_thread(read_trace, tmp_path / "trace")] == [0]
+
+
+async def test_at_the_end_of_a_recording_the_last_frame_is_merged(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path, trace_path=tmp_path / "trace")
+    async with bench.running() as task:
+        for _ in range(3):
+            bench.show(patch(1225))
+        bench.show(None)
+        await asyncio.wait_for(task, 20.0)
+    records = await asyncio.to_thread(read_trace, tmp_path / "trace")
+    assert [record.frame_number for record in records] == [0, 1, 2]
+    last = records[-1]
+    assert last.sent
+    assert last.merged_at_ns is not None
+    assert 0 < last.merged_at_ns - last.captured_at_ns < 10**10
+    assert len(last.keys) // 4 == len(bench.voxels())
+    assert last.shape == (20, 40, 10)

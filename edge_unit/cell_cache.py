@@ -45,11 +45,16 @@ class CellCache:
                 data = await client.mesh(sha256)
                 await asyncio.to_thread(self._write, f"{sha256}.mesh", data)
             meshes[sha256] = data
-        cell = await asyncio.to_thread(Cell.from_document, document, meshes)
-        if cell.version != reference.sha256:
-            # The master's cell changed between its answer and ours, or what lies on disk is damaged.
-            await asyncio.to_thread(self._forget)
-            raise WireError(f"cell {reference.name}: expected version {reference.sha256[:8]}, got {cell.version[:8]}")
+        try:
+            cell = await asyncio.to_thread(Cell.from_document, document, meshes)
+            if cell.version != reference.sha256:
+                raise WireError(
+                    f"cell {reference.name}: expected version {reference.sha256[:8]}, got {cell.version[:8]}"
+                )
+        except CellwatchError:
+            # The master's cell changed between its answer and ours, or what lies on disk is damaged: fetch all anew.
+            await asyncio.to_thread(self._keep_only, set())
+            raise
         if fetched:
             await asyncio.to_thread(self._keep, reference.sha256, document, set(meshes))
         return cell
@@ -69,10 +74,7 @@ class CellCache:
 
     def _keep(self, sha256: str, document: dict[str, Any], meshes: set[str]) -> None:
         self._write(f"{sha256}.json", json.dumps(document).encode())
-        wanted = {f"{sha256}.json", *(f"{mesh}.mesh" for mesh in meshes)}
-        for file in self._folder.iterdir():
-            if file.name not in wanted:
-                file.unlink(missing_ok=True)
+        self._keep_only({f"{sha256}.json", *(f"{mesh}.mesh" for mesh in meshes)})
 
     def _write(self, name: str, data: bytes) -> None:
         """Whole or not at all; a disk that is full costs the cache, not the unit."""
@@ -84,10 +86,13 @@ class CellCache:
         except OSError as error:
             logger.warning("%s: the cell cannot be kept: %s", partial, error)
 
-    def _forget(self) -> None:
-        if self._folder.is_dir():
-            for file in self._folder.iterdir():
-                file.unlink(missing_ok=True)
+    def _keep_only(self, names: set[str]) -> None:
+        try:
+            for file in self._folder.iterdir() if self._folder.is_dir() else ():
+                if file.name not in names:
+                    file.unlink(missing_ok=True)
+        except OSError as error:
+            logger.warning("%s: old cells cannot be removed: %s", self._folder, error)
 
 
 def _mesh_hashes(document: dict[str, Any]) -> list[str]:

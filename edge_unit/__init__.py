@@ -6,6 +6,7 @@ In the order of the flow:
     jit_cache       where compiled kernels are kept, settled before the first is imported
     kernels/        the arithmetic, as pure numba functions on arrays
     sources/        where frames come from
+    recording       a folder of images becomes a recording that the RealSense SDK plays
     inflation       how a mesh grows by a padding
     hull            a link as the solid that reaches a few centimetres around it
     expected_depth  what the camera should see: static layer and robot layer (Algorithms 2 to 5)

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folder of depth images becomes a recording that the RealSense SDK plays: `edge-unit record-images DIR OUT.db3`.
+
+Played through the `realsense` source it gives the same depth, bit for bit, with the same intrinsics and depth scale.
+A recording carries no joints; the source takes them from a file beside it (`joints_file`), whose row i belongs to
+frame number i + 1, as frames are numbered here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from threading import Event
+
+from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.errors import CellwatchError, SourceError
+
+DEFAULT_FPS = 15.0
+"""A recording is played at the pace at which it was written, so it is written at a camera's."""
+
+
+def record_images(images: RecordedSourceConfig, path: Path, fps: float = DEFAULT_FPS) -> int:
+    """Write the images to `path` (.db3), at `fps` frames a second; returns how many there were.
+
+    A process of its own does it, so that the SDK cannot harm this one.
+
+    Raises:
+        SourceError: an image cannot be read, or the recording cannot be written; names the file.
+    """
+    command = (sys.executable, "-m", "edge_unit.recording", images.model_dump_json(), str(path), str(fps))
+    ended = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    if ended.returncode:
+        lines = ended.stderr.strip().splitlines()
+        raise SourceError(lines[-1] if lines else f"{path}: the recorder ended with status {ended.returncode}")
+    return int(ended.stdout)
+
+
+async def _record(images: RecordedSourceConfig, path: Path, fps: float) -> int:
+    from edge_unit.sources.sdk_recorder import RecordedCamera, RecordedStream, SdkRecorder
+
+    source = RecordedSource(images)
+    info = await source.open()
+    lens = info.intrinsics
+    recorder = SdkRecorder(
+        path,
+        RecordedCamera(info.serial, info.model, lens.depth_scale_m, lens.stereo_baseline_m),
+        [RecordedStream("depth", lens.width, lens.height, round(fps), lens.fx, lens.fy, lens.cx, lens.cy)],
+    )
+    count, began_ns, pause = 0, monotonic_ns(), Event()
+    try:
+        async for frame in source.frames():
+            pause.wait(max(began_ns + count * NS_PER_S / fps - monotonic_ns(), 0.0) / NS_PER_S)
+            count += 1
+            recorder.add("depth", frame.depth, count, count * 1000.0 / fps)
+        recorder.close()
+    except SourceError:
+        path.unlink(missing_ok=True)
+        raise
+    return count
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The recording process: a source configuration as JSON, the file, and the rate."""
+    images, path, fps = arguments
+    try:
+        count = asyncio.run(_record(RecordedSourceConfig.model_validate_json(images), Path(path), float(fps)))
+    except CellwatchError as error:
+        print(error, file=sys.stderr)
+        return 1
+    print(count)
+    return 0
+
+
+if __name__ == "__main__":
+    status = main(sys.argv[1:])
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # The SDK's destructors are known to abort.
+    os._exit(status)

@@ -13,6 +13,7 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from types import FrameType
 from urllib.parse import urlsplit
@@ -74,6 +75,9 @@ class Controller:
                 print(f"controller: {error}", file=sys.stderr, flush=True)
                 self._connection.close()
                 due_ns = now_ns + round(RETRY_S * NS_PER_S)
+
+    def close(self) -> None:
+        """Close the connection."""
         self._connection.close()
 
 
@@ -88,7 +92,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
     token = options.token_file.read_text(encoding="ascii").strip()
-    Controller(options.url, token, RobotPath.demo(options.speed), options.epoch_ns).run(options.rate, stopped)
+    with closing(Controller(options.url, token, RobotPath.demo(options.speed), options.epoch_ns)) as controller:
+        controller.run(options.rate, stopped)
     return 0
 
 

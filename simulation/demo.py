@@ -44,11 +44,8 @@ SETTLE_S = 2.0
 DRAIN_S = 0.3
 """After the last frame that counts, for it to be merged."""
 
-REFRESH_S = 0.25
-"""Between two drawings of the table."""
-
-SEEN_EVERY_S = 1.0
-"""The list of unseen blocks is long; asking for it is not free to the master."""
+REFRESH_S = 0.5
+"""Between two drawings of the table. The list of unseen blocks that it asks for is long."""
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -85,6 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with _folder(options.folder) as folder:
             fleet = Fleet(_fleet_options(options), folder)
             outcome = asyncio.run(_run(fleet, options.seconds, screen))
+            screen.leave()
             # The event loop took the handlers with it.
             _raise_when_stopped()
             for failure in outcome.failures:
@@ -126,7 +124,7 @@ async def _run(fleet: Fleet, seconds: float | None, screen: Screen) -> Outcome:
             raise KeyboardInterrupt from None
     finally:
         outcome.failures += [
-            f"{child.name} ended by itself, {child.ended}; the end of its log:\n{child.log_tail()}"
+            f"{child.name} ended by itself, {child.ended}; {child.log_tail()}"
             for child in fleet.processes
             if child.failed
         ]
@@ -172,8 +170,6 @@ class _Observer:
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self._client = httpx.AsyncClient(base_url=fleet.url, headers={"Accept": MEDIA_TYPE}, trust_env=False)
-        self._seen_at_ns: int | None = None
-        self._seen_share: float | None = None
 
     async def __aenter__(self) -> _Observer:
         return self
@@ -183,20 +179,14 @@ class _Observer:
 
     async def look(self) -> tuple[list[UnitLine], MapLine | None]:
         """All units and the merged map; without figures when nobody answers."""
-        now_ns = monotonic_ns()
-        closer = self._seen_at_ns is None or now_ns - self._seen_at_ns >= SEEN_EVERY_S * NS_PER_S
         rows: dict[str, UnitRow] = {}
-        merged = None
         try:
             rows = {row.ip: row for row in map(UnitRow.model_validate, await self._get("/units"))}
-            voxels = await self._get(f"/voxels?form=keys&unseen={str(closer).lower()}")
+            voxels = await self._get("/voxels?form=keys&unseen=true")
+            merged = _map_line(voxels)
         except httpx.HTTPError:
-            self._seen_at_ns = None
-        else:
-            if unseen := voxels["unseen"]:
-                nx, ny, nz = unseen["shape"]
-                self._seen_at_ns, self._seen_share = now_ns, 1.0 - len(unseen["blocks"]) / (nx * ny * nz)
-            merged = MapLine(len(voxels["voxels"]), voxels["complete"], tuple(voxels["reasons"]), self._seen_share)
+            # What it says is that nothing is known; a master that is gone for good ends the demo.
+            merged = None
         return [_line(unit, rows.get(unit.address)) for unit in self._fleet.units], merged
 
     async def _get(self, path: str) -> Any:
@@ -210,6 +200,16 @@ def _line(unit: FleetUnit, row: UnitRow | None) -> UnitLine:
     if row is None:
         return UnitLine(unit.name, unit.address, "starting")
     return UnitLine(unit.name, unit.address, row.state, row.fps, row.voxels, row.process_ms, row.age_s, row.reason)
+
+
+def _map_line(voxels: dict[str, Any]) -> MapLine:
+    nx, ny, nz = voxels["unseen"]["shape"]
+    return MapLine(
+        len(voxels["voxels"]),
+        1.0 - len(voxels["unseen"]["blocks"]) / (nx * ny * nz),
+        voxels["complete"],
+        tuple(voxels["reasons"]),
+    )
 
 
 def _figures(fleet: Fleet, seconds: float | None, outcome: Outcome, screen: Screen) -> dict[str, Any]:

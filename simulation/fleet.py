@@ -97,7 +97,7 @@ class Fleet:
         while not ready_file.exists():
             if self.master.ended:
                 self.master.may_end = True
-                raise MasterUnreachable(f"the master did not start: {self.master.ended}\n{self.master.log_tail()}")
+                raise MasterUnreachable(f"the master did not start: {self.master.ended}; {self.master.log_tail()}")
             await asyncio.sleep(POLL_S)
         self._ready: dict[str, Any] = json.loads(ready_file.read_bytes())
         self.url = self._ready["url"]
@@ -111,7 +111,7 @@ class Fleet:
 
         async def finish() -> None:
             if await child.process.wait():
-                raise ConfigError(f"the kernels cannot be compiled: {child.ended}\n{child.log_tail()}")
+                raise ConfigError(f"the kernels cannot be compiled: {child.ended}; {child.log_tail()}")
 
         return asyncio.ensure_future(finish())
 

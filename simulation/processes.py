@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
-STOP_S = 1.5
+STOP_S = 1.3
 """From the request to stop until the kill; whoever stops all of them counts on two seconds."""
 
 TAIL_LINES = 20
@@ -61,11 +61,11 @@ class Child:
         return self.ended is not None and not self.may_end
 
     def log_tail(self) -> str:
-        """The last lines of its log."""
+        """The last lines of its log, introduced."""
         with self.log.open("rb") as file:
             file.seek(max(file.seek(0, os.SEEK_END) - TAIL_BYTES, 0))
             lines = file.read().decode("utf-8", "replace").splitlines()
-        return "\n".join(lines[-TAIL_LINES:])
+        return "\n".join(("the end of its log:", *lines[-TAIL_LINES:])) if lines else "its log is empty"
 
 
 class Processes:

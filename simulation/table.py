@@ -36,9 +36,9 @@ class MapLine:
     """The merged map as the table shows it."""
 
     voxels: int
+    seen_share: float
     complete: bool
     reasons: tuple[str, ...] = ()
-    seen_share: float | None = None
 
 
 def table(units: Sequence[UnitLine], merged: MapLine | None) -> list[str]:
@@ -87,6 +87,10 @@ class Screen:
             self._last_line_ns = now_ns
             self._write(f"{summary(units, merged)}\n")
 
+    def leave(self) -> None:
+        """The table stays as it is; what is said from now on stands below."""
+        self._drawn = 0
+
     def _erase(self) -> str:
         """Takes the table off the terminal."""
         drawn, self._drawn = self._drawn, 0
@@ -100,9 +104,8 @@ class Screen:
 def _merged(merged: MapLine | None) -> str:
     if merged is None:
         return "nothing yet"
-    seen = "" if merged.seen_share is None else f", {merged.seen_share:.0%} of the cell seen"
     state = "complete" if merged.complete else f"incomplete ({merged.reasons[0] if merged.reasons else 'no reason'})"
-    return f"{merged.voxels:,} voxels{seen}, {state}"
+    return f"{merged.voxels:,} voxels, {merged.seen_share:.0%} of the cell seen, {state}"
 
 
 def _number(value: float | None, decimals: int = 0) -> str:

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import json
 import logging
 import os
+import signal
 import socket
 import sys
 from collections.abc import Sequence
@@ -40,12 +40,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     logging.basicConfig(level=options.log_level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     try:
-        asyncio.run(_serve(_config(options)))
+        _serve(_config(options))
     except CellwatchError as error:
         print(f"master-server: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        return 130
+        logger.info("stopped")
     return 0
 
 
@@ -71,7 +71,7 @@ class _Server(uvicorn.Server):
             print(f"master-server: the token of the {role.value} lies in {lies_in}", flush=True)
 
 
-async def _serve(config: MasterConfig) -> None:
+def _serve(config: MasterConfig) -> None:
     cell = Cell.load(config.cell)
     access = load_access(config.state_dir, config.public_reads)
     app = make_app(Master(cell, config.settings), access)
@@ -99,8 +99,10 @@ async def _serve(config: MasterConfig) -> None:
         config.ready_file,
         config.host,
     )
+    # Once it has stopped in good order, the server raises the signal that it got again.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        await server.serve(sockets=[listener])
+        server.run(sockets=[listener])
     finally:
         listener.close()
         if config.ready_file is not None:

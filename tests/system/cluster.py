@@ -155,7 +155,7 @@ class Cluster:
         until(lambda: list(self.states().values()) == ["live"] * count, f"{count} live units", timeout_s)
 
 
-def stop(process: subprocess.Popen[str], number: signal.Signals = signal.SIGTERM) -> float:
+def stop(process: subprocess.Popen[str], number: signal.Signals) -> float:
     """Tell a process to stop; returns how long it took."""
     began = time.monotonic()
     process.send_signal(number)

@@ -118,13 +118,15 @@ def test_a_wrong_token_is_refused_until_it_is_right(cluster: Cluster) -> None:
     assert unit.poll() is None
 
 
-def test_both_stop_at_once_when_told_to(cluster: Cluster) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_both_stop_at_once_when_told_to(cluster: Cluster, number: signal.Signals) -> None:
     master = cluster.start_master()
     unit = cluster.start_unit(1, source(cluster), T_world_camera=LOOKING_ALONG_Y)
     cluster.until_live(1)
-    assert stop(unit) < STOP_S
+    assert stop(unit, number) < STOP_S
     assert unit.returncode == 0
-    assert stop(master, signal.SIGINT) < STOP_S
+    assert stop(master, number) < STOP_S
+    assert master.returncode == 0
     assert not (cluster.folder / "ready.json").exists()
     assert "Traceback" not in cluster.log("master") + cluster.log("unit1")
 

@@ -21,6 +21,7 @@ In the order of the flow:
     cell_cache      the master's cell, kept on disk
     uplink          the exchange with the master: latest wins
     background      the learned reference, kept on disk
+    camera_memory   the camera that was here, so that its absence can be told
     trace           what was reported, frame by frame, in a file
     config          the unit's own configuration
     unit            the daemon: source, pipeline and uplink held together

@@ -11,6 +11,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, field_validator, model_validator
 
+from edge_unit.sources.realsense import RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSourceConfig, read_pose
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from shared.errors import ConfigError
@@ -59,7 +60,9 @@ class PoseConfig(Configured):
         return read_pose(self.file)
 
 
-SourceConfig = Annotated[RecordedSourceConfig | SimulatedSourceConfig, Field(discriminator="kind")]
+SourceConfig = Annotated[
+    RealsenseSourceConfig | RecordedSourceConfig | SimulatedSourceConfig, Field(discriminator="kind")
+]
 
 
 def default_state_dir() -> Path:

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from edge_unit.background import BackgroundStore, Place
+from edge_unit.camera_memory import CameraMemory
 from edge_unit.cell_cache import CellCache
 from edge_unit.client import MasterClient
 from edge_unit.config import SourceConfig, UnitConfig
@@ -25,8 +26,10 @@ from edge_unit.joints import JointEstimate
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.reference import ReferenceLearner
 from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
+from edge_unit.sources.realsense import RealsenseSource, RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
 from edge_unit.sources.simulated import SimulatedSource
+from edge_unit.sources.status import ReportsStatus
 from edge_unit.trace import Trace, TraceRecord
 from edge_unit.uplink import Assignment, Report, Uplink
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -75,6 +78,7 @@ class Unit:
         configured = config.T_world_camera
         self._pose = None if configured is None else (configured.transform(), "configured")
         self._store = BackgroundStore(config.state_dir)
+        self._memory = CameraMemory(config.state_dir)
         self._trace = None if config.trace_path is None else Trace(config.trace_path)
         self._camera: CameraInfo | None = None
         self._pipeline: DepthPipeline | None = None
@@ -98,6 +102,8 @@ class Unit:
         """
         async with self._client:
             tasks = [asyncio.create_task(self.uplink.run()), asyncio.create_task(self._watch())]
+            if isinstance(self._source, ReportsStatus):
+                tasks.append(asyncio.create_task(self._follow_status(self._source)))
             try:
                 await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             finally:
@@ -128,10 +134,11 @@ class Unit:
                 await self.uplink.drained(DRAIN_S)
                 return
             except SourceError as error:
-                if isinstance(self._config.source, RecordedSourceConfig):
+                if _is_recording(self._config.source):
                     raise
                 logger.warning("%s", error)
                 self.uplink.trouble = f"camera: {error}"[:MAX_TEXT]
+                await self._register_without_camera()
             finally:
                 await self._source.close()
             await asyncio.sleep(retry_s)
@@ -145,11 +152,30 @@ class Unit:
         pose = camera.T_world_camera
         self.uplink.set_camera(camera, self._pose or (None if pose is None else (pose, "source")))
         self.uplink.trouble = None
+        await asyncio.to_thread(self._memory.save, camera)
         await self.uplink.assigned.wait()
         assignment = self.uplink.assignment
         if assignment is not None and assignment.T_world_camera is not None:
             # Before the camera delivers, so that no frame has to wait for what is compiled and drawn only once.
             await asyncio.to_thread(self._prepared, assignment, assignment.T_world_camera)
+
+    async def _register_without_camera(self) -> None:
+        """Have the master know of a camera that should be here: the one that was, if it did not deliver yet."""
+        if self._camera is None:
+            remembered = await asyncio.to_thread(self._memory.load)
+            wanted = getattr(self._config.source, "serial", None)
+            if remembered is not None and wanted in (None, remembered.serial):
+                self.uplink.set_camera(remembered, self._pose)
+
+    async def _follow_status(self, source: ReportsStatus) -> None:
+        """Tell at once how the camera is doing, for the next frame may be long in coming."""
+        status = source.status
+        while True:
+            if status.state != "closed":
+                trouble = status.trouble
+                self.uplink.trouble = None if trouble is None else trouble[:MAX_TEXT]
+                self.uplink.warning = status.warning[:MAX_TEXT] or None
+            status = await source.next_status(status)
 
     async def _take(self, frame: DepthFrame) -> None:
         """Process one frame and offer the result."""
@@ -311,9 +337,18 @@ class Unit:
 
 def make_source(config: SourceConfig) -> DepthSource:
     """The source that the configuration chose."""
+    if isinstance(config, RealsenseSourceConfig):
+        return RealsenseSource(config)
     if isinstance(config, RecordedSourceConfig):
         return RecordedSource(config)
     return SimulatedSource(config)
+
+
+def _is_recording(config: SourceConfig) -> bool:
+    """Whether it will not get better by itself: a file stays as it is."""
+    if isinstance(config, RealsenseSourceConfig):
+        return config.recording is not None
+    return isinstance(config, RecordedSourceConfig)
 
 
 def _warm_up(pipeline: DepthPipeline) -> None:

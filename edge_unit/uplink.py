@@ -113,6 +113,7 @@ class Uplink:
         self.joints = JointHistory()
         self.clock = ClockOffset()
         self.trouble: str | None = None
+        self.warning: str | None = None
 
     # ------------------------------------------------------------------ what the unit calls
 
@@ -260,8 +261,8 @@ class Uplink:
             seen = seen_report(report.seen)
         done = tuple(self._done[:MAX_COMMANDS])
         health = report.health
-        if self.trouble is not None:
-            health = health.model_copy(update={"trouble": self.trouble})
+        if self.trouble is not None or self.warning is not None:
+            health = health.model_copy(update={"trouble": self.trouble or health.trouble, "warning": self.warning})
         sent_at_ns = monotonic_ns()
         answer = await self._client.update(
             UpdateRequest(

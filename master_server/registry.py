@@ -96,7 +96,7 @@ class Slot:
         return (len(captures) - 1) * NS_PER_S / (captures[-1] - captures[0])
 
     def judge(self, now_ns: int, current: Versions, settings: Settings) -> tuple[State, str]:
-        """The unit's state, and the reason in words when it is not live.
+        """The unit's state, and the reason in words when it is not live, or a warning when it is.
 
         `current` has the versions of the master; its pose counts for nothing, each slot has its own.
         """
@@ -112,7 +112,7 @@ class Slot:
             return "blind", f"only {health.valid_share:.0%} of its pixels measure anything"
         if health.static_share >= MOVED_STATIC_SHARE and health.agreeing_share < MOVED_AGREEING_SHARE:
             return "moved", f"only {health.agreeing_share:.0%} of the known surfaces are where they should be"
-        return "live", ""
+        return "live", health.warning or ""
 
     def row(self, now_ns: int, state: State, reason: str) -> UnitRow:
         """What `GET /units` tells."""

@@ -168,6 +168,7 @@ class Health(Message):
     process_ms: float = Field(default=0.0, ge=0.0, description="Time from a frame to its voxels.")
     frame: Counter = Field(default=0, description="Number of the frame.")
     trouble: Text | None = Field(default=None, description="What is wrong at the unit, in one sentence.")
+    warning: Text | None = Field(default=None, description="What is worse than it need be, though it works.")
 
 
 class UpdateRequest(Message):

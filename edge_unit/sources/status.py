@@ -36,10 +36,10 @@ class SourceStatus:
 
     @property
     def trouble(self) -> str | None:
-        """What a person should know, in one sentence; None when all is well."""
-        if self.state not in UNTROUBLED:
-            return f"camera {self.state}: {self.reason}" if self.reason else f"camera {self.state}"
-        return self.warning or None
+        """Why there are no frames, in one sentence; None when there are, or when nobody wants any."""
+        if self.state in UNTROUBLED:
+            return None
+        return f"camera {self.state}: {self.reason}" if self.reason else f"camera {self.state}"
 
 
 @runtime_checkable

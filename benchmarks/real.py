@@ -2,18 +2,18 @@
 """`make real`: a real master and a real unit on recorded frames of a real cell, judged frame by frame.
 
 The unit plays the recording: from the frames of the empty cell it learns the background, then it watches those in which
-a second robot stands. The merged map must hold the second robot, and nothing of the robot that it knows.
+a second robot stands. The merged map must hold the second robot, and nothing of the robot that it knows. It does so
+twice: from the images as they are, and from an SDK recording of them through the RealSense source.
 """
 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import json
-import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,17 @@ from numpy.typing import NDArray
 
 from benchmarks import real_frames
 from benchmarks.real_frames import EMPTY_FRAMES, WATCHED_FRAMES, FrameMarks, RealFrames
+from edge_unit.config import ENVIRONMENT_PREFIX as UNIT_PREFIX
+from edge_unit.config import SourceConfig
 from edge_unit.pipeline import DepthPipeline
+from edge_unit.recording import record_images
+from edge_unit.sources.realsense import RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSourceConfig, open_recording
 from edge_unit.trace import read_trace
+from master_server.config import ENVIRONMENT_PREFIX as MASTER_PREFIX
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, SourceError
+from simulation.processes import Child, Processes
 
 READY_S = 60.0
 """For a process to come up and compile its kernels on a slow machine."""
@@ -42,6 +48,9 @@ POLL_S = 0.05
 
 PICTURE_DEPTH_M = 4.0
 """Depth that is drawn in the last colour."""
+
+ORDER = [*EMPTY_FRAMES, *WATCHED_FRAMES]
+"""In which the recording is played: first it learns, then it watches."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,37 +67,54 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         folder = real_frames.find()
         cell = real_frames.cell(folder)
-        info = open_recording(_source(folder))
+        images = _images(folder)
+        info = open_recording(images)
         assert info.T_world_camera is not None
         pipeline = DepthPipeline(info.intrinsics, info.T_world_camera, cell, real_frames.default_settings())
         frames = real_frames.load(folder, pipeline)
-        maps = play(folder, [*EMPTY_FRAMES, *WATCHED_FRAMES])
+        print("playing the images ...", flush=True)
+        maps = asyncio.run(play(folder, images))
+        print("writing them as an SDK recording, and playing that ...", flush=True)
+        recorded = asyncio.run(play_recording(folder, images))
     except CellwatchError as error:
         print(f"make real: {error}", file=sys.stderr)
         return 1
-    result = judge(frames, maps, options.out)
+    result = judge(frames, maps, recorded, options.out)
     print(json.dumps(result))
     return 0 if result["passed"] else 1
 
 
-def play(folder: Path, order: list[int]) -> dict[int, SeenMap]:
-    """Have a real unit play `order` to a real master; returns the merged map of each frame that was watched."""
+async def play_recording(folder: Path, images: RecordedSourceConfig) -> dict[int, SeenMap]:
+    """The same frames as an SDK recording, through the RealSense source."""
+    with tempfile.TemporaryDirectory(prefix="cellwatch-recording-") as scratch:
+        recording, joints_file = Path(scratch) / "frames.db3", Path(scratch) / "joints.csv"
+        await asyncio.to_thread(record_images, images.model_copy(update={"fps": None}), recording, 1.0 / FRAME_S)
+        joints = np.loadtxt(folder / "joint_states_rad.csv", delimiter=",")
+        np.savetxt(joints_file, joints[ORDER], delimiter=",", fmt="%.12f")
+        source = RealsenseSourceConfig(
+            recording=recording, joints_file=joints_file, fx_stereo=real_frames.STEREO_FOCAL_PX
+        )
+        return await play(folder, source)
+
+
+async def play(folder: Path, source: SourceConfig) -> dict[int, SeenMap]:
+    """Have a real unit play the frames to a real master; returns the merged map of each frame that was watched."""
     with tempfile.TemporaryDirectory(prefix="cellwatch-real-") as scratch:
         state = Path(scratch)
-        with (
-            _master(state) as ready,
-            httpx.Client(base_url=ready["url"], headers=_operator(ready)) as client,
-            _unit(state, ready, folder, order) as unit,
-        ):
-            maps = _watch(client, unit, order, state / "unit.log")
+        async with Processes(state / "logs", without=(UNIT_PREFIX, MASTER_PREFIX)) as processes:
+            ready = await _start_master(processes, state)
+            unit = await _start_unit(processes, state, ready, folder, source)
+            async with httpx.AsyncClient(base_url=ready["url"], headers=_operator(ready)) as client:
+                maps = await _watch(client, unit, isinstance(source, RealsenseSourceConfig))
+        first = 1 if isinstance(source, RealsenseSourceConfig) else 0
         for record in read_trace(state / "trace.msgpack"):
-            frame = order[record.frame_number]
+            frame = ORDER[record.frame_number - first]
             if frame in maps and not np.array_equal(np.frombuffer(record.keys, "<u4"), maps[frame].keys):
                 raise SourceError(f"frame {frame}: the merged map is not what the only unit reported")
     return maps
 
 
-def judge(frames: RealFrames, maps: dict[int, SeenMap], out: Path) -> dict[str, Any]:
+def judge(frames: RealFrames, maps: dict[int, SeenMap], recorded: dict[int, SeenMap], out: Path) -> dict[str, Any]:
     """Print the marks of each frame, draw its picture, and sum up."""
     out.mkdir(parents=True, exist_ok=True)
     marks: list[FrameMarks] = []
@@ -104,8 +130,10 @@ def judge(frames: RealFrames, maps: dict[int, SeenMap], out: Path) -> dict[str, 
             f"frame {frame}: leak {marks[-1].robot_leak_percent:.3f} %, "
             f"missed {marks[-1].second_robot_miss_percent:.2f} %, "
             f"second robot {marks[-1].second_robot_voxels} voxels, false {marks[-1].false_voxels}, "
-            f"{seen.process_ms:.1f} ms, picture {picture}"
+            f"{seen.process_ms:.1f} ms from images, {recorded[frame].process_ms:.1f} ms from the recording, "
+            f"picture {picture}"
         )
+    equal = all(np.array_equal(maps[frame].keys, recorded[frame].keys) for frame in WATCHED_FRAMES)
     leak = max(mark.robot_leak_percent for mark in marks)
     miss = max(mark.second_robot_miss_percent for mark in marks)
     voxels = min(mark.second_robot_voxels for mark in marks)
@@ -117,9 +145,11 @@ def judge(frames: RealFrames, maps: dict[int, SeenMap], out: Path) -> dict[str, 
         "false_voxels_max": false,
         "frames": len(marks),
         "map_equals_pipeline": same,
+        "recording_equals_images": equal,
         "process_ms_max": round(max(seen.process_ms for seen in maps.values()), 2),
+        "recording_process_ms_max": round(max(seen.process_ms for seen in recorded.values()), 2),
         "pictures": str(out),
-        "passed": leak <= 0.3 and miss <= 2.5 and voxels >= 90 and false == 0 and same,
+        "passed": leak <= 0.3 and miss <= 2.5 and voxels >= 90 and false == 0 and same and equal,
     }
 
 
@@ -152,97 +182,77 @@ def _coloured(depth_m: NDArray[Any]) -> NDArray[np.uint8]:
     return image
 
 
-def _watch(client: httpx.Client, unit: subprocess.Popen[bytes], order: list[int], log: Path) -> dict[int, SeenMap]:
+async def _watch(client: httpx.AsyncClient, unit: Child, counts_from_one: bool) -> dict[int, SeenMap]:
     """Ask for the merged map until there is one of each watched frame."""
     maps: dict[int, SeenMap] = {}
-    deadline_ns = monotonic_ns() + round((READY_S + len(order) * FRAME_S) * NS_PER_S)
+    deadline_ns = monotonic_ns() + round((READY_S + len(ORDER) * FRAME_S) * NS_PER_S)
     while set(maps) != set(WATCHED_FRAMES):
-        if monotonic_ns() > deadline_ns or (unit.poll() is not None and unit.returncode != 0):
-            raise SourceError(f"the unit did not show all frames, only {sorted(maps)}; its log ends:\n{_tail(log)}")
-        before = _row(client)
-        answer = client.get("/voxels", params={"form": "keys"}).raise_for_status().json()
-        after = _row(client)
+        if monotonic_ns() > deadline_ns or unit.failed:
+            raise SourceError(f"the unit did not show all frames, only {sorted(maps)}; {unit.log_tail()}")
+        before = await _row(client)
+        answer = (await client.get("/voxels", params={"form": "keys"})).raise_for_status().json()
+        after = await _row(client)
         if before is not None and after is not None and before["health"]["frame"] == after["health"]["frame"]:
-            frame = order[after["health"]["frame"]]
-            if frame in WATCHED_FRAMES and after["state"] == "live" and after["health"]["trouble"] is None:
+            place = after["health"]["frame"] - counts_from_one
+            if after["state"] == "live" and after["health"]["trouble"] is None and ORDER[place] in WATCHED_FRAMES:
                 keys = np.array(answer["voxels"], np.uint32)
-                maps[frame] = SeenMap(keys, float(after["process_ms"]))
-        try:
-            unit.wait(POLL_S)
-        except subprocess.TimeoutExpired:
-            continue
+                maps[ORDER[place]] = SeenMap(keys, float(after["process_ms"]))
+        await asyncio.sleep(POLL_S)
     return maps
 
 
-def _row(client: httpx.Client) -> dict[str, Any] | None:
+async def _row(client: httpx.AsyncClient) -> dict[str, Any] | None:
     """The only unit, if it is there."""
-    units = client.get("/units").raise_for_status().json()
+    units = (await client.get("/units")).raise_for_status().json()
     rows: list[dict[str, Any]] = units["units"] if isinstance(units, dict) else units
     return rows[0] if rows else None
 
 
-@contextmanager
-def _master(state: Path) -> Iterator[dict[str, Any]]:
-    """A real master at a free port; yields what it says when it is ready."""
+async def _start_master(processes: Processes, state: Path) -> dict[str, Any]:
+    """A real master at a free port; returns what it says when it is ready."""
     ready_file = state / "ready.json"
-    command = [
-        *(sys.executable, "-m", "master_server", "--cell", str(real_frames.CELL), "--host", "127.0.0.1", "--port", "0"),
+    master = await processes.start(
+        "master",
+        "master_server",
+        *("--cell", str(real_frames.CELL), "--host", "127.0.0.1", "--port", "0"),
         *("--state-dir", str(state / "master"), "--ready-file", str(ready_file), "--set", "settings.stale_after_s=5.0"),
-    ]
-    with _process(command, state / "master.log") as process:
-        deadline_ns = monotonic_ns() + round(READY_S * NS_PER_S)
-        while not ready_file.exists():
-            if process.poll() is not None or monotonic_ns() > deadline_ns:
-                raise SourceError(f"the master did not start; its log ends:\n{_tail(state / 'master.log')}")
-            try:
-                process.wait(POLL_S)
-            except subprocess.TimeoutExpired:
-                continue
-        yield json.loads(ready_file.read_text())
+    )
+    deadline_ns = monotonic_ns() + round(READY_S * NS_PER_S)
+    while not ready_file.exists():
+        if master.ended or monotonic_ns() > deadline_ns:
+            raise SourceError(f"the master did not start; {master.log_tail()}")
+        await asyncio.sleep(POLL_S)
+    ready: dict[str, Any] = json.loads(ready_file.read_text())
+    return ready
 
 
-@contextmanager
-def _unit(state: Path, ready: dict[str, Any], folder: Path, order: list[int]) -> Iterator[subprocess.Popen[bytes]]:
-    """A real unit that learns from the first frames of `order` and watches the rest."""
+async def _start_unit(
+    processes: Processes, state: Path, ready: dict[str, Any], folder: Path, source: SourceConfig
+) -> Child:
+    """A real unit that learns from the first frames and watches the rest."""
     config = {
         "master_url": ready["url"],
         "token_file": ready["unit_token_file"],
         "state_dir": str(state / "unit"),
-        "source": _source(folder).model_dump(mode="json") | {"frames": order, "fps": 1.0 / FRAME_S},
+        "source": source.model_dump(mode="json"),
+        "T_world_camera": {"file": str(folder / "T_base_optical.txt")},
         "learn_background_frames": len(EMPTY_FRAMES),
         "trace_path": str(state / "trace.msgpack"),
     }
     path = state / "unit.yaml"
     path.write_text(yaml.safe_dump(config))
-    with _process([sys.executable, "-m", "edge_unit", "run", str(path)], state / "unit.log") as process:
-        yield process
+    return await processes.start("unit", "edge_unit", "run", str(path), may_end=True)
 
 
-@contextmanager
-def _process(command: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A process that is gone when the block is left."""
-    with log.open("wb") as output, subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT) as process:
-        try:
-            yield process
-        finally:
-            process.terminate()
-            try:
-                process.wait(5.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-
-
-def _source(folder: Path) -> RecordedSourceConfig:
-    return RecordedSourceConfig(folder=folder, fx_stereo=real_frames.STEREO_FOCAL_PX)
+def _images(folder: Path) -> RecordedSourceConfig:
+    return RecordedSourceConfig(
+        folder=folder, frames=tuple(ORDER), fps=1.0 / FRAME_S, fx_stereo=real_frames.STEREO_FOCAL_PX
+    )
 
 
 def _operator(ready: dict[str, Any]) -> dict[str, str]:
     token = Path(ready["operator_token_file"]).read_text().strip()
     return {"Authorization": f"Bearer {token}"}
-
-
-def _tail(log: Path, lines: int = 12) -> str:
-    return "\n".join(log.read_text(errors="replace").splitlines()[-lines:])
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -50,6 +50,17 @@ def test_a_shift_shows_in_the_residual() -> None:
         assert health.residual_share == pytest.approx(part, abs=0.05)
 
 
+def test_the_residual_is_the_median() -> None:
+    """Most of the picture is nearer than expected, the rest farther; outliers count for nothing."""
+    depth = np.full(CAMERA.shape, 1500, np.uint16)
+    depth[:, :190] -= 20
+    depth[:, 190:300] += 30
+    depth[:, 300:] = 3000
+    health = check(depth)
+    assert -0.5 < health.residual_share < -0.1
+    assert health.agreeing_share == pytest.approx(300 / 320, abs=0.03)
+
+
 def test_the_robot_and_the_unknown_are_left_out() -> None:
     half_unknown = WALL_M.copy()
     half_unknown[:, :160] = np.inf

@@ -378,6 +378,16 @@ def test_what_the_robot_hides_is_not_seen() -> None:
     assert watched.seen().seen.sum() > 100
 
 
+def test_what_a_halo_may_hide_is_not_seen() -> None:
+    """Beside the crate, at its own depth, nothing would be reported."""
+    haloed, plain = pipeline(), pipeline(static_padding_m=0.0)
+    for watched in (haloed, plain):
+        watched.process(look(), [0.3])
+    with_halo, without = haloed.seen().seen, plain.seen().seen
+    assert not (with_halo & ~without).any()
+    assert with_halo.sum() < without.sum()
+
+
 def test_stage_times_are_those_of_the_last_frame() -> None:
     watched = pipeline()
     assert watched.last.total_ns == 0

@@ -306,3 +306,15 @@ def test_a_floor_that_runs_beneath_the_camera_is_cut_not_lost(cells: int) -> Non
     assert screen.drawn[below].all()
     assert np.allclose(1.0 / screen.nearest_w[below], z[below, None], rtol=1e-5)
     assert not screen.drawn[y < screen.cy].any()
+
+
+def test_triangles_about_a_point_below_the_camera_leave_no_gap() -> None:
+    """All are cut, and each edge between two of them is a column of pixels."""
+    screen = Screen(301, 203, 100.0)
+    columns = np.arange(-160, 161)
+    apex = np.array([[0.0, 0.3, 0.0]])
+    rim = np.stack((0.1 * columns, np.full(len(columns), 0.3), np.full(len(columns), 10.0)), axis=-1)
+    k = np.arange(1, len(columns))
+    faces = np.stack((np.zeros_like(k), k, k + 1), axis=-1)
+    screen.draw([TriangleMesh("fan", np.concatenate((apex, rim)), faces, closed=False)], [np.eye(4)])
+    assert screen.drawn[105:].all()

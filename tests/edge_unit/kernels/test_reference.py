@@ -88,7 +88,7 @@ def test_learns_what_the_twin_learns(seed: int) -> None:
         depth = np.take_along_axis(surfaces, np.minimum(pick, 2)[..., None], axis=-1)[..., 0]
         depth = (depth + rng.normal(0, 4, shape)).astype(np.uint16)
         depth[pick == 3] = 0
-        wild = rng.random(shape) < 0.03
+        wild = rng.random(shape) < 0.1
         depth[wild] = rng.choice(np.arange(1200, 6000, 1500), wild.sum())
         robot = rng.random(shape) < 0.3
         near = np.where(robot, rng.integers(400, 3000, shape), RAW_MAX).astype(np.uint16)

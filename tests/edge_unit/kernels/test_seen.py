@@ -133,6 +133,17 @@ def test_what_hides_a_block() -> None:
     assert 0 < look(wall, far, far).sum() < everything.sum()
 
 
+def test_a_block_is_seen_by_rays_that_end_on_its_far_side() -> None:
+    far = np.full(CAMERA.shape, 65535, np.uint16)
+    key, (*_, far_raw) = next(iter(views_twin(LATTICE, ABOVE).items()))
+    for image in range(3):
+        images = [far, far, far]
+        images[image] = np.full(CAMERA.shape, far_raw, np.uint16)
+        assert look(*images)[key] == 1
+        images[image] = images[image] - np.uint16(1)
+        assert look(*images)[key] == 0
+
+
 def test_a_share_of_the_rays_may_fail() -> None:
     rng = np.random.default_rng(0)
     far = np.full(CAMERA.shape, 65535, np.uint16)

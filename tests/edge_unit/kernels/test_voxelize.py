@@ -105,15 +105,19 @@ def test_no_pixel_is_marked() -> None:
     assert counter.found == 0
 
 
-def test_a_border_belongs_to_the_voxel_above_and_the_last_one_to_none() -> None:
-    """All numbers are exact in float32: pixels 1/4 voxel apart along x, from -1 to 5, on a lattice of 4."""
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_border_belongs_to_the_voxel_above_and_the_last_one_to_none(axis: int) -> None:
+    """All numbers are exact in float32: pixels 1/4 voxel apart along an axis, from -1 to 5, on a lattice of 4."""
     depth = np.full((1, 25), 4, np.uint16)
     column = np.zeros((25, 3), np.float32)
-    column[:, 0] = np.arange(25) / 16.0
-    origin = np.array([-1.0, 0.0, 0.0], np.float32)
-    counter = Counter((4, 1, 1), 25)
+    column[:, axis] = np.arange(25) / 16.0
+    origin = np.zeros(3, np.float32)
+    origin[axis] = -1.0
+    shape = [1, 1, 1]
+    shape[axis] = 4
+    counter = Counter((shape[0], shape[1], shape[2]), 25)
     counts = counter.run(depth, np.ones(depth.shape, np.bool_), column, np.zeros((1, 3), np.float32), origin)
-    assert counts[:, 0, 0].tolist() == [4, 4, 4, 4]
+    assert counts.ravel().tolist() == [4, 4, 4, 4]
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

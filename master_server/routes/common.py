@@ -79,7 +79,10 @@ def wants_msgpack(request: Request) -> bool:
     return MEDIA_TYPE in request.headers.get("accept", "")
 
 
-def master_of(request: Request) -> Master:
+# Dependencies are coroutines throughout: the framework sends plain functions to a thread, at ten times the cost.
+
+
+async def master_of(request: Request) -> Master:
     """The one master of this application."""
     master = request.app.state.master
     assert isinstance(master, Master)
@@ -98,22 +101,22 @@ def authorization_of(request: Request) -> bytes | None:
     return next((value for name, value in request.scope["headers"] if name == b"authorization"), None)
 
 
-def may_read(request: Request) -> None:
+async def may_read(request: Request) -> None:
     """Dependency: any token, or none where reads are public."""
     access_of(request).check_read(authorization_of(request))
 
 
-def is_operator(request: Request) -> None:
+async def is_operator(request: Request) -> None:
     """Dependency: the operator's token."""
     access_of(request).check(authorization_of(request), OPERATORS)
 
 
-def is_unit(request: Request) -> None:
+async def is_unit(request: Request) -> None:
     """Dependency: the units' token."""
     access_of(request).check(authorization_of(request), UNITS)
 
 
-def is_known(request: Request) -> Role:
+async def is_known(request: Request) -> Role:
     """Dependency: either token; tells whose it is."""
     return access_of(request).check(authorization_of(request), UNITS | OPERATORS)
 

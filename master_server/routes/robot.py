@@ -5,11 +5,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Request, Response
 
-from master_server.routes.common import OPERATOR_ONLY, READERS, MasterDependency, Negotiated
+from master_server.routes.common import OPERATOR_ONLY, READERS, MasterDependency, Negotiated, wants_msgpack
 from shared.clock import monotonic_ns
 from shared.messages import JointsRequest, RobotAnswer
+from shared.wire import MEDIA_TYPE, encode
 
 router = APIRouter(tags=["robot"], route_class=Negotiated)
 
@@ -20,12 +21,17 @@ async def put_joints(body: JointsRequest, master: MasterDependency) -> None:
     master.put_joints(body, monotonic_ns())
 
 
-@router.get("/robot", dependencies=READERS)
+@router.get("/robot", dependencies=READERS, response_model=RobotAnswer)
 async def robot(
+    request: Request,
     master: MasterDependency,
     since_ns: Annotated[
         int | None, Query(ge=0, lt=2**63, description="All samples after this time, not only the newest.")
     ] = None,
-) -> RobotAnswer:
+) -> Response:
     """Whether the robot reports, and its joints by the master's clock, of which `now_ns` is now."""
-    return master.robot_answer(since_ns, monotonic_ns())
+    answer = master.robot_answer(since_ns, monotonic_ns())
+    # Units ask before every frame, so not by way of JSON.
+    if wants_msgpack(request):
+        return Response(encode(answer), media_type=MEDIA_TYPE)
+    return Response(answer.model_dump_json(), media_type="application/json")

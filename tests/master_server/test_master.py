@@ -368,11 +368,11 @@ def test_a_new_lattice_drops_all_voxels_and_takes_none_of_the_old() -> None:
 def test_other_settings_leave_the_map_alone() -> None:
     one = master()
     unit = live(one, 1, 1)
-    one.change_settings({"occupancy_threshold": 0.6})
+    one.change_settings({"occupancy_threshold": 1.25})
     assert shown(one) == {1: 1}
     answer = unit.update(NOW_NS, [1])
     assert answer.settings is not None
-    assert answer.settings.occupancy_threshold == 0.6
+    assert answer.settings.occupancy_threshold == 1.25
     assert unit.update(NOW_NS, [1]).settings is None
 
 

@@ -44,17 +44,17 @@ class FilterSettings(BaseModel):
         description="Never ask for more surface than this (m2), so that thin things survive large voxels.",
     )
     support_points_min: int = Field(
-        default=40,
+        default=32,
         ge=0,
         le=10_000,
-        description="Never decide on fewer points than this: neighbouring pixels are matched by one window, and far "
-        "away or at a low resolution one wrong match fills a voxel. Three full voxels are always enough.",
+        description="Never decide on fewer points than this, half a window of stereo matching: far away, or at a low "
+        "resolution, one wrong match fills a voxel. Three full voxels are always enough.",
     )
     margin_base_m: float = Field(
         default=0.03, ge=0.0, le=0.5, description="Constant part of the margin before CAD surfaces, in metres."
     )
     margin_noise_gain: float = Field(
-        default=4.0, ge=0.0, le=20.0, description="Standard deviations of stereo noise in the margin before CAD."
+        default=4.25, ge=0.0, le=20.0, description="Standard deviations of stereo noise in the margin before CAD."
     )
     stereo_subpixel_px: float = Field(
         default=0.12, ge=0.01, le=1.0, description="Standard deviation of the camera's disparity, in pixels."

@@ -2,8 +2,7 @@
 """A folder of depth images becomes a recording that the RealSense SDK plays: `edge-unit record-images DIR OUT.db3`.
 
 Played through the `realsense` source it gives the same depth, bit for bit, with the same intrinsics and depth scale.
-A recording carries no joints; the source takes them from a file beside it (`joints_file`), whose row i belongs to
-frame number i + 1, as frames are numbered here.
+A recording carries no joints; they are written to a file beside it, OUT.joints.csv, for the source's `joints_file`.
 """
 
 from __future__ import annotations
@@ -16,6 +15,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from threading import Event
 
+import numpy as np
+
+from edge_unit.sources.realsense import RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, SourceError
@@ -27,7 +29,8 @@ DEFAULT_FPS = 15.0
 def record_images(images: RecordedSourceConfig, path: Path, fps: float = DEFAULT_FPS) -> int:
     """Write the images to `path` (.db3), at `fps` frames a second; returns how many there were.
 
-    A process of its own does it, so that the SDK cannot harm this one.
+    Joints that the images carry go to `joints_path(path)`. A process of its own does it, so that the SDK cannot harm
+    this one.
 
     Raises:
         SourceError: an image cannot be read, or the recording cannot be written; names the file.
@@ -38,6 +41,22 @@ def record_images(images: RecordedSourceConfig, path: Path, fps: float = DEFAULT
         lines = ended.stderr.strip().splitlines()
         raise SourceError(lines[-1] if lines else f"{path}: the recorder ended with status {ended.returncode}")
     return int(ended.stdout)
+
+
+def joints_path(recording: Path) -> Path:
+    """Where the joints of a recording lie: row i is of frame number i + 1."""
+    return recording.with_suffix(".joints.csv")
+
+
+def played(images: RecordedSourceConfig, recording: Path) -> RealsenseSourceConfig:
+    """What plays `recording` as `record_images` wrote it: each frame once, in the order of `images`."""
+    joints = joints_path(recording)
+    return RealsenseSourceConfig(
+        recording=recording,
+        real_time=False,
+        joints_file=joints if joints.is_file() else None,
+        fx_stereo=images.fx_stereo,
+    )
 
 
 async def _record(images: RecordedSourceConfig, path: Path, fps: float) -> int:
@@ -51,16 +70,21 @@ async def _record(images: RecordedSourceConfig, path: Path, fps: float) -> int:
         RecordedCamera(info.serial, info.model, lens.depth_scale_m, lens.stereo_baseline_m),
         [RecordedStream("depth", lens.width, lens.height, round(fps), lens.fx, lens.fy, lens.cx, lens.cy)],
     )
-    count, began_ns, pause = 0, monotonic_ns(), Event()
+    count, joints, began_ns, pause = 0, [], monotonic_ns(), Event()
     try:
         async for frame in source.frames():
             pause.wait(max(began_ns + count * NS_PER_S / fps - monotonic_ns(), 0.0) / NS_PER_S)
             count += 1
             recorder.add("depth", frame.depth, count, count * 1000.0 / fps)
+            if frame.joints is not None:
+                joints.append(frame.joints)
         recorder.close()
     except SourceError:
         path.unlink(missing_ok=True)
         raise
+    joints_path(path).unlink(missing_ok=True)
+    if joints:
+        np.savetxt(joints_path(path), joints, fmt="%.17g", delimiter=",")
     return count
 
 

@@ -24,7 +24,7 @@ from edge_unit.sources import capture_link as link
 from edge_unit.sources.sdk_devices import Devices, RecordingBroken, Unplugged, survey
 from edge_unit.sources.sdk_stream import Reading, SdkStream
 from edge_unit.sources.shared_frames import SharedFrames
-from shared.clock import NS_PER_MS, monotonic_ns
+from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import SourceEnded, SourceError
 
 READ_S = 0.1
@@ -32,10 +32,11 @@ READ_S = 0.1
 
 ALIVE_EVERY_NS = 100 * NS_PER_MS
 
-FIRST_FRAME_MS = 6_000
+FIRST_FRAME_S = 6.0
 """From the start of the stream: cameras settle their exposure first, some for seconds."""
 
-SILENCE_MS = 2_000
+SILENCE_S = 2.0
+SILENCE_PERIODS = 4
 """Without a frame, once they came: the stream is stuck, and waiting was never seen to help."""
 
 CUT_SHORT_S = 0.5
@@ -100,7 +101,8 @@ class Capture:
         link.send(self._end, opened, descriptor)
         os.close(descriptor)
         base, last = self._request.number_base, self._request.resume_after
-        deadline_ns = monotonic_ns() + FIRST_FRAME_MS * NS_PER_MS
+        silence_ns = round(max(SILENCE_S, SILENCE_PERIODS / max(opened.fps, 1)) * NS_PER_S)
+        deadline_ns = monotonic_ns() + round(FIRST_FRAME_S * NS_PER_S)
         while not self._stop.is_set():
             if self._devices.removed.is_set():
                 raise Unplugged(f"camera {opened.serial} was unplugged")
@@ -116,7 +118,7 @@ class Capture:
             if reading is not None:
                 last = reading.camera_number
                 self._deliver(frames, reading, base + last)
-                deadline_ns = monotonic_ns() + SILENCE_MS * NS_PER_MS
+                deadline_ns = monotonic_ns() + silence_ns
             elif monotonic_ns() > deadline_ns:
                 raise SourceError(f"camera {opened.serial} stopped sending frames")
             self._alive()

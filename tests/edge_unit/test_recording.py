@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
-from edge_unit.recording import record_images
-from edge_unit.sources.realsense import RealsenseSource, RealsenseSourceConfig
+from edge_unit.recording import joints_path, played, record_images
+from edge_unit.sources.realsense import RealsenseSource
 from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
 from shared.errors import SourceError
 from tests.edge_unit.sources import recordings
@@ -41,10 +41,10 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-async def check_same(images: RecordedSourceConfig, recording: Path, joints: Path | None) -> int:
+async def check_same(images: RecordedSourceConfig, recording: Path) -> int:
     """Every frame, its joints and the camera are the same from both; returns how many frames there were."""
     first = RecordedSource(images)
-    second = RealsenseSource(RealsenseSourceConfig(recording=recording, real_time=False, joints_file=joints))
+    second = RealsenseSource(await asyncio.to_thread(played, images, recording))
     count = 0
     try:
         expected, info = await first.open(), await second.open()
@@ -55,11 +55,12 @@ async def check_same(images: RecordedSourceConfig, recording: Path, joints: Path
         assert lens == pytest.approx(wanted, rel=1e-7)
         frames = second.frames()
         async for frame in first.frames():
-            played = await anext(frames)
-            np.testing.assert_array_equal(played.depth, frame.depth)
-            assert played.frame_number == frame.frame_number + 1
-            if joints is not None:
-                np.testing.assert_array_equal(played.joints, frame.joints)
+            again = await anext(frames)
+            np.testing.assert_array_equal(again.depth, frame.depth)
+            assert again.frame_number == frame.frame_number + 1
+            assert frame.joints is not None
+            assert again.joints is not None
+            np.testing.assert_array_equal(again.joints, frame.joints)
             count += 1
         with pytest.raises(StopAsyncIteration):
             await anext(frames)
@@ -69,17 +70,34 @@ async def check_same(images: RecordedSourceConfig, recording: Path, joints: Path
 
 
 async def test_images_survive_bit_for_bit(folder: Path, tmp_path: Path) -> None:
-    images = RecordedSourceConfig(folder=folder, serial="A1", depth_scale_m=0.00025, stereo_baseline_m=0.095)
+    images = RecordedSourceConfig(
+        folder=folder, serial="A1", depth_scale_m=0.00025, stereo_baseline_m=0.095, fx_stereo=55.0
+    )
     recording = tmp_path / "images.db3"
     assert await asyncio.to_thread(record_images, images, recording, FPS) == 9
-    assert await check_same(images, recording, folder / "joint_states_rad.csv") == 9
+    assert await check_same(images, recording) == 9
+
+
+async def test_chosen_frames_keep_their_order_and_their_joints(folder: Path, tmp_path: Path) -> None:
+    images = RecordedSourceConfig(folder=folder, frames=("07", "02", 3))
+    recording = tmp_path / "images.db3"
+    assert await asyncio.to_thread(record_images, images, recording, FPS) == 3
+    assert await check_same(images, recording) == 3
+
+
+async def test_joints_of_a_recording_before_are_gone(folder: Path, tmp_path: Path) -> None:
+    recording = tmp_path / "images.db3"
+    await asyncio.to_thread(record_images, RecordedSourceConfig(folder=folder), recording, FPS)
+    (folder / "joint_states_rad.csv").unlink()
+    await asyncio.to_thread(record_images, RecordedSourceConfig(folder=folder), recording, FPS)
+    assert not joints_path(recording).exists()
 
 
 async def test_real_frames_survive_bit_for_bit(data_dir: Path, tmp_path: Path) -> None:
     images = RecordedSourceConfig(folder=data_dir / "xarm7_realsense")
     recording = tmp_path / "xarm7.db3"
     assert await asyncio.to_thread(record_images, images, recording, FPS) == 10
-    assert await check_same(images, recording, data_dir / "xarm7_realsense" / "joint_states_rad.csv") == 10
+    assert await check_same(images, recording) == 10
 
 
 def test_errors_name_the_file(folder: Path, tmp_path: Path) -> None:

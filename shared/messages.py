@@ -235,7 +235,7 @@ class RobotAnswer(Message):
     state: Literal["fresh", "stale", "silent", "none"]
     reason: Text = ""
     joint_names: tuple[str, ...]
-    age_s: float | None
+    age_s: float | None = None
     now_ns: Nanoseconds
     joints: tuple[JointSample, ...]
 

@@ -236,6 +236,8 @@ async def test_msgpack_both_ways(desk: Desk) -> None:
     response = await desk.call("PUT", "/settings", content=body, headers=MSGPACK)
     assert response.headers["content-type"] == MEDIA_TYPE
     assert decode(Settings, response.content).voxel_size_m == 0.04
+    silent = decode(RobotAnswer, (await desk.call("GET", "/robot?since_ns=0", headers=MSGPACK)).content)
+    assert (silent.state, silent.age_s, silent.joints) == ("silent", None, ())
     joints = msgpack.packb({"positions": [0.1, 0.2], "velocities": [0.0, 0.0]})
     assert (await desk.call("PUT", "/robot/joints", content=joints, headers=MSGPACK)).status_code == 204
     robot = decode(RobotAnswer, (await desk.call("GET", "/robot", headers=MSGPACK)).content)

@@ -175,6 +175,8 @@ class Unit:
                 trouble = status.trouble
                 self.uplink.trouble = None if trouble is None else trouble[:MAX_TEXT]
                 self.uplink.warning = status.warning[:MAX_TEXT] or None
+                if status.state == "absent":
+                    await self._register_without_camera()
             status = await source.next_status(status)
 
     async def _take(self, frame: DepthFrame) -> None:

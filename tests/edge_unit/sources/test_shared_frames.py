@@ -96,7 +96,6 @@ for number in range(1, 20001):
 def test_nothing_is_torn_between_two_processes() -> None:
     shape = (200, 320)
     descriptor = SharedFrames.create(shape, np.uint16)
-    names = set(os.listdir("/dev/shm"))
     reader = SharedFrames(descriptor, shape, np.uint16)
     with subprocess.Popen((sys.executable, "-c", WRITER, str(descriptor)), pass_fds=(descriptor,)) as writer:
         os.close(descriptor)
@@ -112,7 +111,6 @@ def test_nothing_is_torn_between_two_processes() -> None:
             assert reader.intact(frame)
     assert last == 20000
     assert seen > 5
-    assert set(os.listdir("/dev/shm")) == names
 
 
 def test_the_memory_has_no_name(memory: int) -> None:

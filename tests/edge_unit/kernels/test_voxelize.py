@@ -16,7 +16,9 @@ class Counter:
 
     def __init__(self, shape: tuple[int, int, int], pixels: int) -> None:
         self.shape = shape
-        self.counts = np.zeros(int(np.prod(shape)), np.uint32)
+        # Whatever is written behind the lattice shows in the guard.
+        self.memory = np.zeros(int(np.prod(shape)) + 1000, np.uint32)
+        self.counts = self.memory[: int(np.prod(shape))]
         self.touched = np.full(min(pixels, self.counts.size), 0xFFFFFFFF, np.uint32)
         self.found = 0
 
@@ -39,9 +41,10 @@ class Counter:
             row_rays,
             origin,
             np.array(self.shape, np.int32),
-            self.counts,
+            self.memory,
             self.touched,
         )
+        assert not self.memory[self.counts.size :].any()
         touched = self.touched[: self.found]
         assert len(set(touched.tolist())) == self.found
         assert sorted(touched.tolist()) == np.nonzero(self.counts)[0].tolist()

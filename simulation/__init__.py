@@ -20,5 +20,6 @@ and tests need no clock. In the order of the flow:
     fleet        a master, its units and the controller as real processes
     table        the demo's live table
     demo         the command line
+    picture      the README's picture
     pluggable    RealSense cameras that are plugged in and out: recordings on the SDK's context
 """

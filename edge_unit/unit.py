@@ -9,6 +9,7 @@ made with, so that nothing is ever merged under another lattice, cell or pose th
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import importlib.metadata
 import logging
 from collections.abc import AsyncGenerator
@@ -157,7 +158,9 @@ class Unit:
         assignment = self.uplink.assignment
         if assignment is not None and assignment.T_world_camera is not None:
             # Before the camera delivers, so that no frame has to wait for what is compiled and drawn only once.
-            await asyncio.to_thread(self._prepared, assignment, assignment.T_world_camera)
+            # What cannot be prepared is told with each frame, for the master may change it.
+            with contextlib.suppress(InputError):
+                await asyncio.to_thread(self._prepared, assignment, assignment.T_world_camera)
 
     async def _register_without_camera(self) -> None:
         """Have the master know of a camera that should be here: the one that was, if it did not deliver yet."""

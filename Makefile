@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real test lint clean libusb
+.PHONY: help demo real sweeps test lint clean libusb
 
 ARGS ?=
 EXTRAS := edge,master,realsense,sim,dev
@@ -28,6 +28,12 @@ demo: $(READY) ## a simulated cell with a moving robot, people and many cameras
 
 real: $(READY) ## the filter on recorded frames of a real cell (CELLWATCH_DATA names where they lie)
 	@$(BIN)/python -m benchmarks.real $(ARGS)
+
+sweeps: $(READY) ## how thin, how small, how silent: the filter before simulated cameras
+	@$(BIN)/python -m benchmarks.sweeps $(ARGS)
+
+pictures: $(READY) ## the pictures of the README, painted anew
+	@$(BIN)/python -m simulation.picture assets/pictures/demo.png
 
 test: $(READY) libusb lint ## lint, then all tests but the slow ones; with SLOW=1 these too
 	@$(BIN)/python -m pytest -q $(if $(SLOW),,-m "not slow") $(ARGS)

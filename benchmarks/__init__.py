@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the filter is worth, in figures; each run prints its table and leaves it as JSON in `results/`.
+
+In the order of the flow:
+
+    report     tables for people, marks, and one line of JSON for machines
+    stage      one camera before one thing: a bare scene whose every pixel is a ray cast by Embree
+    thickness  how thin a thing on a table may be before it is lost
+    shapes     plates and rods that must never be lost, speckle that must be
+    quiet      a cell in which nothing but the robot moves: no voxel may be reported
+    walkers    people in the simulated cell: how much of them is missed
+    sweeps     all of these, as one table
+    real_frames the real recordings, and what must come out of them
+    real         a real master and a real unit on them, judged frame by frame
+"""

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables for people, marks, and one line of JSON for machines."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).resolve().parent / "results"
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A figure that must not be above (`at_most`) or below (`at_least`) a limit."""
+
+    name: str
+    value: float
+    at_most: float | None = None
+    at_least: float | None = None
+
+    @property
+    def met(self) -> bool:
+        """A figure that is NaN meets nothing."""
+        below = self.at_most is None or self.value <= self.at_most
+        return below and (self.at_least is None or self.value >= self.at_least)
+
+    def document(self) -> dict[str, Any]:
+        """As plain values, without the bound that it does not have."""
+        return {key: _plain(value) for key, value in asdict(self).items() if value is not None} | {"met": self.met}
+
+    def __str__(self) -> str:
+        bound = f"at most {self.at_most:g}" if self.at_most is not None else f"at least {self.at_least:g}"
+        return f"{'met   ' if self.met else 'MISSED'}  {self.name}: {self.value:.4g} ({bound})"
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one sweep found: a table, marks, and remarks in words."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str | float, ...], ...]
+    marks: tuple[Mark, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    def document(self) -> dict[str, Any]:
+        """As plain values; a row is an object by column."""
+        return {
+            "title": self.title,
+            "rows": [dict(zip(self.columns, map(_plain, row), strict=True)) for row in self.rows],
+            "marks": [mark.document() for mark in self.marks],
+            "remarks": list(self.remarks),
+        }
+
+    def __str__(self) -> str:
+        lines = [self.title, *table(self.columns, self.rows), *self.remarks, *map(str, self.marks)]
+        return "\n".join(lines)
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[str | float]]) -> list[str]:
+    """Lines of a table with the columns' names on top; numbers stand to the right."""
+    cells = [list(columns)] + [[_text(value) for value in row] for row in rows]
+    right = [all(not isinstance(row[i], str) for row in rows) for i in range(len(columns))]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
+    return [
+        "  " + "  ".join(f"{cell:>{w}}" if r else f"{cell:<{w}}" for cell, w, r in zip(row, widths, right, strict=True))
+        for row in cells
+    ]
+
+
+def line(document: dict[str, Any]) -> str:
+    """`document` as one line of JSON."""
+    return json.dumps(document, allow_nan=False, separators=(",", ":"))
+
+
+def write(name: str, document: dict[str, Any], folder: Path = RESULTS) -> None:
+    """Leave `document` in `folder`/`name`.json."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def _plain(value: str | float) -> str | float | None:
+    """JSON knows no NaN; six digits are more than is known."""
+    if not isinstance(value, float):
+        return value
+    return None if math.isnan(value) else float(f"{value:.6g}")
+
+
+def _text(value: str | float) -> str:
+    return value if isinstance(value, str) else f"{value:.4g}"

@@ -273,7 +273,7 @@ def test_settings_take_effect_with_the_next_frame() -> None:
     assert not watched.foreground(noisy, [0.3]).any()
     watched.apply(FilterSettings(margin_base_m=0.0, margin_noise_gain=0.0, edge_radius_px=0, static_padding_m=0.0))
     assert watched.foreground(noisy, [0.3]).mean() > 0.1
-    watched.apply(FilterSettings(robot_padding_m=0.0, robot_depth_m=0.0))
+    watched.apply(FilterSettings(robot_padding_m=0.1, robot_depth_m=0.0))
     assert not watched.foreground(still, [0.3])[0:10].any()
     watched.apply(FilterSettings())
     assert not watched.foreground(noisy, [0.3]).any()

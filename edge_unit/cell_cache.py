@@ -39,7 +39,7 @@ class CellCache:
         if document is None:
             document = await client.cell_document()
         meshes: dict[str, bytes] = {}
-        for sha256 in _mesh_hashes(document):
+        for sha256 in mesh_hashes(document):
             data = await asyncio.to_thread(self._read_mesh, sha256)
             if data is None:
                 data = await client.mesh(sha256)
@@ -95,7 +95,7 @@ class CellCache:
             logger.warning("%s: old cells cannot be removed: %s", self._folder, error)
 
 
-def _mesh_hashes(document: dict[str, Any]) -> list[str]:
+def mesh_hashes(document: dict[str, Any]) -> list[str]:
     """The hashes that a cell's document names, wherever they stand: 64 hexadecimal digits under `mesh`."""
     found: set[str] = set()
     pending: list[Any] = [document]

@@ -17,7 +17,8 @@ from pathlib import Path
 import pyrealsense2 as rs
 
 from edge_unit.sources import capture_link as link
-from edge_unit.sources.capture_process import Capture, main
+from edge_unit.sources.capture import Capture
+from edge_unit.sources.capture_process import main
 
 LOOK_EVERY_S = 0.02
 

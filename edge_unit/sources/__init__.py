@@ -19,7 +19,8 @@ A RealSense camera is captured by a process of its own, which alone loads the SD
     sdk_clock           when a frame of the SDK was taken
     sdk_stream          one stream of one camera or recording
     sdk_recorder        recordings written from images
-    capture_process     the process: from looking for the camera to whatever ends it
+    capture             from looking for the camera to whatever ends it
+    capture_process     the process in which that is done
     watchdog            when it counts as stuck, and how the next one begins
     capture_session     one such process in the hands of the unit
     capture_supervisor  one such process after the other

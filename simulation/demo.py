@@ -156,8 +156,10 @@ async def _watch(fleet: Fleet, seconds: float | None, screen: Screen, outcome: O
                 if not waiting:
                     outcome.begin_ns = now_ns + round(SETTLE_S * NS_PER_S)
                     outcome.end_ns = outcome.begin_ns + round(seconds * NS_PER_S)
+                elif any(child.failed for child in fleet.processes):
+                    return
                 elif now_ns - started_ns > START_S * NS_PER_S:
-                    outcome.failures += [f"{line.name} is {line.state} ({line.reason})" for line in waiting]
+                    outcome.failures += [f"{line.name} is {line.state}: {line.reason}" for line in waiting]
                     return
             if outcome.end_ns is not None and now_ns > outcome.end_ns + DRAIN_S * NS_PER_S:
                 return
@@ -297,7 +299,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add(
         "--seconds",
-        type=_number(1.0, 3600.0),
+        type=_number(1.0, 600.0),
         metavar="S",
         help="let the frames of S seconds count, then end and tell (default: run until stopped)",
     )

@@ -29,8 +29,8 @@ MASTER_PREFIX = "CELLWATCH_MASTER_"
 FIRST_ADDRESS = IPv4Address("127.0.0.2")
 """Of the first unit; 127.0.0.1 is the master's."""
 
-QUIET_S = 3.0
-"""Warming up takes less than this when all is compiled."""
+QUIET_S = 5.0
+"""Warming up takes less than this when all is compiled, unless the machine is very busy."""
 
 POLL_S = 0.02
 """Between looks at whether the master is up."""

@@ -18,7 +18,7 @@ from simulation import demo
         (("--people", "3"), "--people: expected 0 to 2, got 3"),
         (("--resolution", "100x100"), "--resolution: expected one of 424x240, "),
         (("--voxel-size", "1"), "--voxel-size: expected 0.01 to 0.1, got 1"),
-        (("--seconds", "nan"), "--seconds: expected 1 to 3600, got nan"),
+        (("--seconds", "nan"), "--seconds: expected 1 to 600, got nan"),
         (("--fps", "many"), "--fps: invalid number value: 'many'"),
     ],
 )

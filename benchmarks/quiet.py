@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo cell in which nothing moves but its robot: every voxel that is reported is a false one."""
+"""The demo cell in which nothing moves but its robot: every voxel that is reported is a false one.
+
+All that stands still is in CAD, or nothing is and all of it is learned.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +22,11 @@ CAMERAS = 4
 FRAME_S = 0.137
 """Between frames; no part of the robot's period, so that it is met in ever other poses."""
 
+LEARNED_FRAMES = 100
+"""Ten seconds of the empty cell at ten frames a second: the robot's shadow fills in."""
+
+LEARNED_S = 0.1
+
 FALSE_SHARE_MAX = 0.005
 
 EXAMPLES = 8
@@ -27,9 +35,10 @@ EXAMPLES = 8
 
 @dataclass(frozen=True)
 class Part:
-    """Frames `first` to `last` (exclusive) of one camera."""
+    """Frames `first` to `last` (exclusive) of one camera, in a cell in CAD or learned."""
 
     camera: int
+    learned: bool
     first: int
     last: int
 
@@ -39,16 +48,18 @@ class Quiet:
     """What came of a part: frames, frames with false voxels, false voxels, and a few of these in words."""
 
     camera: int
+    learned: bool
     frames: int
     false_frames: int
     false_voxels: int
     examples: tuple[str, ...]
 
 
-def parts(frames: int, length: int) -> list[Part]:
-    """`frames` of each camera, in parts of at most `length`."""
+def parts(frames: int, length: int, learned_too: bool) -> list[Part]:
+    """`frames` of each camera, in parts of at most `length`, in a cell in CAD and, if asked for, in a learned one."""
     return [
-        Part(camera, first, min(first + length, frames))
+        Part(camera, learned, first, min(first + length, frames))
+        for learned in (False, True)[: 1 + learned_too]
         for camera in range(CAMERAS)
         for first in range(0, frames, length)
     ]
@@ -59,7 +70,11 @@ def watch(part: Part, intrinsics: Intrinsics, settings: FilterSettings) -> Quiet
     world = World.demo(people=0)
     pose = rig(world.cell, CAMERAS)[part.camera]
     camera = SimulatedCamera(world, pose, intrinsics, renderer="raycast", seed=part.camera)
-    pipeline = DepthPipeline(intrinsics, pose, world.cell, settings)
+    known = replace(world.cell, static=(), objects=()) if part.learned else world.cell
+    pipeline = DepthPipeline(intrinsics, pose, known, settings)
+    if part.learned:
+        before = (camera.capture(-LEARNED_S * (number + 1)) for number in range(LEARNED_FRAMES))
+        pipeline.use(pipeline.learn((frame.depth, frame.joints) for frame in before))
     false_frames, false_voxels = 0, 0
     examples: list[str] = []
     for number in range(part.first, part.last):
@@ -70,26 +85,37 @@ def watch(part: Part, intrinsics: Intrinsics, settings: FilterSettings) -> Quiet
         for centre, count in zip(voxels.lattice.centres(voxels.indices), voxels.counts, strict=True):
             if len(examples) < EXAMPLES:
                 x, y, z = np.round(centre, 3)
-                examples.append(f"camera {part.camera}, frame {number}: {count} points at {x:g}, {y:g}, {z:g} m")
-    return Quiet(part.camera, part.last - part.first, false_frames, false_voxels, tuple(examples))
+                where = f"{_KIND[part.learned]} cell, camera {part.camera}, frame {number}"
+                examples.append(f"{where}: {count} points at {x:g}, {y:g}, {z:g} m")
+    return Quiet(part.camera, part.learned, part.last - part.first, false_frames, false_voxels, tuple(examples))
 
 
 def result(found: list[Quiet], intrinsics: Intrinsics) -> Result:
-    """One row a camera, and the mark over all of them."""
+    """One row a camera, and a mark for each kind of cell."""
     rows: list[tuple[str | float, ...]] = []
-    for camera in range(CAMERAS):
-        mine = [each for each in found if each.camera == camera]
-        frames, false_frames = sum(each.frames for each in mine), sum(each.false_frames for each in mine)
-        voxels = sum(each.false_voxels for each in mine)
-        rows.append((str(camera), frames, false_frames, voxels, 100.0 * false_frames / max(frames, 1)))
-    frames, false_frames = sum(each.frames for each in found), sum(each.false_frames for each in found)
-    share = 100.0 * false_frames / max(frames, 1)
-    rows.append(("all", frames, false_frames, sum(each.false_voxels for each in found), share))
+    marks = []
+    for learned in sorted({each.learned for each in found}):
+        kind = _KIND[learned]
+        mine = [each for each in found if each.learned == learned]
+        for camera in range(CAMERAS):
+            rows.append((kind, str(camera), *_counts([each for each in mine if each.camera == camera])))
+        rows.append((kind, "all", *_counts(mine)))
+        share = float(rows[-1][-1])
+        marks.append(Mark(f"{kind} cell: frames with false voxels, %", share, at_most=100.0 * FALSE_SHARE_MAX))
     return Result(
         f"Nothing but the moving robot, {CAMERAS} cameras of {intrinsics.width}x{intrinsics.height}, "
         "rays by Embree, joints exact at the frame's time",
-        ("camera", "frames", "with false voxels", "false voxels", "with false voxels %"),
+        ("cell", "camera", "frames", "with false voxels", "false voxels", "with false voxels %"),
         tuple(rows),
-        (Mark("frames with false voxels, %", share, at_most=100.0 * FALSE_SHARE_MAX),),
+        tuple(marks),
         tuple(example for each in found for example in each.examples)[:EXAMPLES],
     )
+
+
+def _counts(found: list[Quiet]) -> tuple[int, int, int, float]:
+    """Frames, those with false voxels, false voxels, share of the second in per cent."""
+    frames, false_frames = sum(each.frames for each in found), sum(each.false_frames for each in found)
+    return frames, false_frames, sum(each.false_voxels for each in found), 100.0 * false_frames / max(frames, 1)
+
+
+_KIND = {False: "CAD", True: "learned"}

@@ -34,7 +34,7 @@ QUICK_DISTANCES_M = (1.0, 2.0)
 
 ROD_TILTS_DEG = (shapes.ROD_TILT_MAX_DEG, 90.0)
 
-PART_FRAMES = 50
+PART_FRAMES = 100
 """Frames that a process takes at a time: long enough to be worth a cell and a camera, short enough to share well."""
 
 Job = Callable[[], Any]
@@ -52,6 +52,7 @@ class Amount:
     rods: int = 300
     speckles: int = 300
     frames: int = 1000
+    learned_too: bool = True
     moments: int = 150
     people: tuple[int, ...] = (1, 2)
     intrinsics: Intrinsics = field(default_factory=d435i_intrinsics)
@@ -105,7 +106,7 @@ def plates_rods_speckle(amount: Amount, settings: FilterSettings, run: Run) -> R
 
 def quiet_cell(amount: Amount, settings: FilterSettings, run: Run) -> Result:
     """Nothing but the moving robot."""
-    parts = quiet.parts(amount.frames, PART_FRAMES)
+    parts = quiet.parts(amount.frames, PART_FRAMES, amount.learned_too)
     found = run([partial(quiet.watch, part, amount.intrinsics, settings) for part in parts])
     return quiet.result(found, amount.intrinsics)
 

@@ -19,6 +19,7 @@ and tests need no clock. In the order of the flow:
     processes    child processes that never outlive their parent
     fleet        a master, its units and the controller as real processes
     table        the demo's live table
+    show         the demo itself
     demo         the command line
     picture      the README's picture
     pluggable    RealSense cameras that are plugged in and out: recordings on the SDK's context

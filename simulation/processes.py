@@ -11,9 +11,9 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 
-STOP_S = 1.3
+STOP_S = 1.2
 """From the request to stop until the kill; whoever stops all of them counts on two seconds."""
 
 TAIL_LINES = 20
@@ -25,12 +25,25 @@ TAIL_BYTES = 8192
 PR_SET_PDEATHSIG = 1
 """See prctl(2)."""
 
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""By which people and service managers ask for an end."""
+
 _LIBC = ctypes.CDLL(None)
 
 
 def die_with_parent(number: int = signal.SIGKILL) -> None:
     """From now on the kernel sends this process `number` when its parent is gone, however that came to pass."""
     _LIBC.prctl(PR_SET_PDEATHSIG, int(number), 0, 0, 0)
+
+
+def raise_when_stopped() -> None:
+    """From now on a request to end raises KeyboardInterrupt, even where a shell had it ignored."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    for number in STOP_SIGNALS:
+        signal.signal(number, stop)
 
 
 @dataclass(eq=False)

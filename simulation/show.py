@@ -1,23 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make demo`: a master, several units and a robot's controller as real processes, and people who walk about.
-
-Cameras, robot and people are simulated; all else is what runs in a real cell.
-"""
+"""The demo itself: a fleet that is watched live, and what it reported held against what was there."""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
 import json
-import os
-import signal
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import httpx
@@ -31,7 +25,7 @@ from shared.wire import MEDIA_TYPE
 from simulation.camera import D435I_FOCAL_PX, MAX_RIG
 from simulation.evaluation import evaluate
 from simulation.fleet import QUIET_S, Fleet, FleetOptions, FleetUnit
-from simulation.processes import die_with_parent
+from simulation.processes import STOP_SIGNALS, raise_when_stopped
 from simulation.table import MapLine, Screen, UnitLine
 from simulation.world import MAX_DEMO_PEOPLE
 
@@ -47,12 +41,7 @@ DRAIN_S = 0.3
 REFRESH_S = 0.5
 """Between two drawings of the table. The list of unseen blocks that it asks for is long."""
 
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
 RESOLUTIONS = ", ".join(f"{width}x{height}" for width, height in D435I_FOCAL_PX)
-
-EXIT_STOPPED = 130
-"""What shells call an end by Ctrl-C."""
 
 FRAME_RATE_SHARE_MIN = 14.0 / 15.0
 CAPTURE_TO_MAP_MS_MAX = 66.0
@@ -63,36 +52,37 @@ MISSED_FRACTION_MAX = 0.02
 
 @dataclass
 class Outcome:
-    """How a run ended: the time whose frames count, once it is known, and what went wrong."""
+    """How a run ended: the time whose frames count, once it is known; if someone stopped it; what went wrong."""
 
     begin_ns: int | None = None
     end_ns: int | None = None
+    stopped: bool = False
     failures: list[str] = field(default_factory=list)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the demo; exit code 1 when something failed, 130 when stopped before its time."""
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run the demo; exit code 1 when something failed.
+
+    Raises:
+        KeyboardInterrupt: it was stopped before its time.
+    """
     options = _parse(arguments)
-    if "MAKELEVEL" in os.environ:
-        # When make is killed, nobody is left to stop this.
-        die_with_parent(signal.SIGTERM)
     screen = Screen(sys.stderr if options.json else sys.stdout)
     try:
-        _raise_when_stopped()
         with _folder(options.folder) as folder:
             fleet = Fleet(_fleet_options(options), folder)
             outcome = asyncio.run(_run(fleet, options.seconds, screen))
-            screen.leave()
             # The event loop took the handlers with it.
-            _raise_when_stopped()
+            raise_when_stopped()
+            screen.leave()
             for failure in outcome.failures:
                 screen.say(f"demo: {failure}")
+            if outcome.stopped and options.seconds is not None:
+                raise KeyboardInterrupt
             figures = _figures(fleet, options.seconds, outcome, screen)
     except CellwatchError as error:
         screen.say(f"demo: {error}")
         return 1
-    except KeyboardInterrupt:
-        return EXIT_STOPPED
     if options.json:
         print(json.dumps(figures), flush=True)
     elif options.seconds is not None:
@@ -120,14 +110,10 @@ async def _run(fleet: Fleet, seconds: float | None, screen: Screen) -> Outcome:
             await _start(fleet, screen)
             await _watch(fleet, seconds, screen, outcome)
     except asyncio.CancelledError:
-        if seconds is not None:
-            raise KeyboardInterrupt from None
-    finally:
-        outcome.failures += [
-            f"{child.name} ended by itself, {child.ended}; {child.log_tail()}"
-            for child in fleet.processes
-            if child.failed
-        ]
+        outcome.stopped = True
+    outcome.failures += [
+        f"{child.name} ended by itself, {child.ended}; {child.log_tail()}" for child in fleet.processes if child.failed
+    ]
     return outcome
 
 
@@ -136,10 +122,13 @@ async def _start(fleet: Fleet, screen: Screen) -> None:
     await fleet.start_master()
     screen.say(f"Cellwatch demo: {fleet.url} (try: curl {fleet.url}/voxels; Ctrl-C stops)")
     warm_up = await fleet.start_warm_up()
-    await asyncio.wait((warm_up,), timeout=QUIET_S)
-    if not warm_up.done():
-        screen.say("compiling kernels (only the first time, about a minute) ...")
-    await warm_up
+    try:
+        await asyncio.wait((warm_up,), timeout=QUIET_S)
+        if not warm_up.done():
+            screen.say("compiling kernels (only the first time, about a minute) ...")
+        await warm_up
+    finally:
+        warm_up.cancel()
     await fleet.start_units()
 
 
@@ -244,16 +233,6 @@ def _marks_missed(figures: dict[str, Any], fps: float) -> list[str]:
     return [name for name, is_kept in kept.items() if not is_kept]
 
 
-def _raise_when_stopped() -> None:
-    """Ctrl-C and a request to end raise KeyboardInterrupt, even where a shell had them ignored."""
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    for number in STOP_SIGNALS:
-        signal.signal(number, stop)
-
-
 @contextmanager
 def _folder(wanted: Path | None) -> Iterator[Path]:
     """Where everything is kept: `wanted`, which stays, or else a temporary one."""
@@ -354,7 +333,3 @@ def _resolution(text: str) -> tuple[int, int]:
     if not (width.isdigit() and height.isdigit() and (int(width), int(height)) in D435I_FOCAL_PX):
         raise argparse.ArgumentTypeError(f"expected one of {RESOLUTIONS}, got {text}")
     return int(width), int(height)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -8,6 +8,17 @@ from pathlib import Path
 import pytest
 
 from simulation import demo
+from simulation.processes import STOP_SIGNALS
+
+
+@pytest.fixture(autouse=True)
+def own_signals(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The demo owns its process; here it is a guest."""
+    monkeypatch.delenv("MAKELEVEL", raising=False)
+    before = [(number, signal.getsignal(number)) for number in STOP_SIGNALS]
+    yield
+    for number, handler in before:
+        signal.signal(number, handler)
 
 
 @pytest.mark.parametrize(
@@ -31,17 +42,6 @@ def test_wrong_options_are_refused_in_words(
     assert sentence in capsys.readouterr().err
 
 
-@pytest.fixture
-def own_signals(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The demo owns its process; here it is a guest."""
-    monkeypatch.delenv("MAKELEVEL", raising=False)
-    before = [(number, signal.getsignal(number)) for number in demo.STOP_SIGNALS]
-    yield
-    for number, handler in before:
-        signal.signal(number, handler)
-
-
-@pytest.mark.usefixtures("own_signals")
 def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "precious").touch()
     assert demo.main(("--folder", str(tmp_path))) == 1

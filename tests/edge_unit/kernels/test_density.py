@@ -8,7 +8,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from edge_unit.kernels.density import expected_angular, expected_pinhole, keep_dense, neighbourhood_count
+from edge_unit.kernels.density import (
+    AT_ONCE,
+    expected_angular,
+    expected_pinhole,
+    keep_dense,
+    locate,
+    neighbourhood_count,
+)
 from shared.lattice import Lattice
 from shared.transforms import Transform, apply, from_xyz_rpy, inverse
 
@@ -26,16 +33,17 @@ def kept(
     own_share_min: float = 0.05,
     area_max_m2: float = 0.0025,
     points_min: float = 0.0,
-    touched: NDArray[np.uint32] | None = None,
 ) -> set[int]:
-    if touched is None:
-        touched = np.nonzero(counts.ravel())[0].astype(np.uint32)
-    out = np.full(len(touched), 0xFFFFFFFF, np.uint32)
+    rimmed = np.pad(counts, 1)
+    slots = np.flatnonzero(rimmed).astype(np.uint32)
+    # One more for what lies outside the lattice; its points count for nothing.
+    memory = np.append(rimmed.ravel(), np.uint32(10**6)).astype(np.uint32)
+    keys, kept_counts = (np.full(len(slots) + 1, 0xFFFFFFFF, np.uint32) for _ in range(2))
     T_camera_world = inverse(T_world_camera)
     number = keep_dense(
-        counts.ravel(),
-        touched,
-        len(touched),
+        memory,
+        slots,
+        len(slots),
         np.array(lattice.shape, np.int32),
         lattice.voxel_size_m,
         apply(T_camera_world, lattice.centres(np.zeros(3))),
@@ -50,10 +58,14 @@ def kept(
         own_share_min,
         area_max_m2,
         points_min,
-        out,
+        np.empty((6, AT_ONCE)),
+        np.empty(AT_ONCE, np.uint32),
+        keys,
+        kept_counts,
     )
-    assert len(set(out[:number].tolist())) == number
-    return set(out[:number].tolist())
+    assert (np.diff(keys[:number].astype(np.int64)) > 0).all(), "in the order of the slots"
+    assert (kept_counts[:number] == counts.ravel()[keys[:number]]).all()
+    return set(keys[:number].tolist())
 
 
 def twin(
@@ -89,7 +101,7 @@ def twin(
 @pytest.mark.parametrize("angular", [False, True])
 @pytest.mark.parametrize("single", [False, True])
 @pytest.mark.parametrize("size_m", [0.01, 0.05, 0.1])
-@pytest.mark.parametrize("shape", [(12, 9, 7), (1, 1, 1), (40, 1, 2)])
+@pytest.mark.parametrize("shape", [(12, 9, 7), (1, 1, 1), (40, 1, 2), (3, 170, 4)])
 def test_keeps_what_the_twin_keeps(angular: bool, single: bool, size_m: float, shape: tuple[int, int, int]) -> None:
     rng = np.random.default_rng(sum(shape) + int(1000 * size_m))
     lattice = Lattice((-0.3, 0.1, -0.2), size_m, shape)
@@ -117,8 +129,28 @@ def test_the_neighbourhood_ends_at_the_lattice() -> None:
     shape = (3, 4, 5)
     counts = np.random.default_rng(0).integers(0, 9, shape).astype(np.uint32)
     around = ndimage.convolve(counts.astype(int), np.ones((3, 3, 3), int), mode="constant")
+    rimmed = np.pad(counts, 1)
+    per_y, per_x = np.uint64(rimmed.shape[2]), np.uint64(rimmed.shape[1] * rimmed.shape[2])
     for index in np.ndindex(shape):
-        assert neighbourhood_count(counts.ravel(), *index, *shape) == around[index]
+        slot = np.ravel_multi_index(tuple(np.array(index) + 1), rimmed.shape)
+        assert neighbourhood_count(rimmed.ravel(), np.uint64(slot), per_y, per_x) == around[index]
+
+
+@pytest.mark.parametrize("shape", [(512, 512, 512), (32767, 1, 4096), (1, 32767, 4096), (4096, 1, 32767), (1, 1, 1)])
+def test_slots_of_the_largest_lattices_are_located_exactly(shape: tuple[int, int, int]) -> None:
+    """By floating point, for integers are not divided by vectors; the first and last of each row count most."""
+    rng = np.random.default_rng(0)
+    index = rng.integers(0, shape, (3000, 3))
+    index[:1000] = np.where(rng.random((1000, 3)) < 0.5, 0, np.array(shape) - 1)
+    _, ny, nz = shape
+    slots = ((index[:, 0] + 1) * (ny + 2) + index[:, 1] + 1) * (nz + 2) + index[:, 2] + 1
+    keys, z_m, distance_m = np.empty(3000, np.uint32), np.empty(3000), np.empty(3000)
+    first_m, axes = np.array((0.1, -0.2, 0.3)), rng.normal(0.0, 0.01, (3, 3))
+    locate(slots.astype(np.uint32), np.array(shape, np.int32), first_m, axes, keys, z_m, distance_m)
+    assert (keys == (index[:, 0] * ny + index[:, 1]) * nz + index[:, 2]).all()
+    centres_m = first_m + index @ axes.T
+    assert np.allclose(z_m, centres_m[:, 2])
+    assert np.allclose(distance_m, np.linalg.norm(centres_m, axis=1))
 
 
 def test_a_hand_on_a_border_survives_here_and_not_in_the_paper() -> None:

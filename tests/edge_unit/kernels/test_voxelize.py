@@ -12,14 +12,18 @@ DOUBT_VOXELS = 1e-3
 
 
 class Counter:
-    """The kernel with its memory."""
+    """The kernel with its memory: the lattice, a rim about it, a slot for what lies outside, and a guard behind."""
 
     def __init__(self, shape: tuple[int, int, int], pixels: int) -> None:
         self.shape = shape
-        # Whatever is written behind the lattice shows in the guard.
-        self.memory = np.zeros(int(np.prod(shape)) + 1000, np.uint32)
-        self.counts = self.memory[: int(np.prod(shape))]
-        self.touched = np.full(min(pixels, self.counts.size), 0xFFFFFFFF, np.uint32)
+        rimmed = tuple(number + 2 for number in shape)
+        end = int(np.prod(rimmed))
+        self.memory = np.zeros(end + 1 + 1000, np.uint32)
+        self.counts = self.memory[: end + 1]
+        self.guard = self.memory[end + 1 :]
+        self.grid = self.counts[:end].reshape(rimmed)
+        self.voxels = self.grid[1:-1, 1:-1, 1:-1]
+        self.touched = np.full(min(pixels, self.voxels.size) + 1, 0xFFFFFFFF, np.uint32)
         self.found = 0
 
     def run(
@@ -30,6 +34,7 @@ class Counter:
         row_rays: NDArray[np.float32],
         origin: NDArray[np.float32],
     ) -> NDArray[np.uint32]:
+        """`column_rays` (W, 3) here, as `row_rays` (H, 3)."""
         height, width = depth.shape
         padded = np.zeros((height, -(-width // 8) * 8), np.uint8)
         padded[:, :width] = mask
@@ -37,21 +42,24 @@ class Counter:
             depth,
             padded.view(np.uint64),
             padded,
-            column_rays,
+            np.ascontiguousarray(column_rays.T),
             row_rays,
             origin,
             np.array(self.shape, np.int32),
-            self.memory,
+            np.empty(width, np.int32),
+            self.counts,
             self.touched,
         )
-        assert not self.memory[self.counts.size :].any()
+        assert not self.guard.any()
         touched = self.touched[: self.found]
         assert len(set(touched.tolist())) == self.found
-        assert sorted(touched.tolist()) == np.nonzero(self.counts)[0].tolist()
-        return self.counts.reshape(self.shape).copy()
+        assert sorted(touched.tolist()) == np.flatnonzero(self.grid).tolist()
+        assert self.voxels.sum() == self.grid.sum(), "the rim stays empty"
+        return self.voxels.copy()
 
     def forget(self) -> None:
         forget(self.counts, self.touched, self.found)
+        assert not self.grid.any()
 
 
 def positions(
@@ -96,7 +104,6 @@ def test_counts_what_the_twin_counts(width: int, shape: tuple[int, int, int]) ->
         mask &= (np.abs(points - np.rint(points)) > DOUBT_VOXELS).all(axis=-1)
         assert (counter.run(depth, mask, column, row, origin) == twin(points, mask, shape)).all()
         counter.forget()
-        assert not counter.counts.any()
 
 
 def test_no_pixel_is_marked() -> None:

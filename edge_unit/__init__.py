@@ -17,7 +17,6 @@ In the order of the flow:
     health          does what the camera sees still fit what it should see
     pipeline        the method, one line a stage
     joints          the robot's joints at a frame's time
-    http            requests over connections that stay open
     client          what a unit can ask the master
     cell_cache      the master's cell, kept on disk
     uplink          the exchange with the master: latest wins

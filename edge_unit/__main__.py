@@ -24,6 +24,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; what can be expected to go wrong is one line and exit code 1."""
     options = _parser().parse_args(arguments)
     logging.basicConfig(level=options.log_level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    # One line for each request would fill the journal.
+    logging.getLogger("httpx").setLevel(logging.WARNING)
+    logging.getLogger("httpcore").setLevel(logging.WARNING)
     try:
         config = load(UnitConfig, options.config, os.environ, ENVIRONMENT_PREFIX, assignments(options.set))
         config.read_token()

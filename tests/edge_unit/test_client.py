@@ -2,14 +2,14 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Callable
 
+import httpx
 import numpy as np
 import pytest
 
 from edge_unit.client import MAX_MESH_BYTES, MasterClient
-from edge_unit.http import Answer
-from shared.errors import MasterRefused, MasterUnreachable, WireError
+from shared.errors import ConfigError, MasterRefused, MasterUnreachable, UplinkError, WireError
 from shared.messages import Health, JointSample, UpdateAnswer, UpdateRequest, Versions
 from shared.timebase import Exchange
 from shared.wire import MAX_ANSWER_BYTES, decode_update, encode_update_answer, keys_to_bytes
@@ -41,95 +41,79 @@ def update(count: int = 0) -> UpdateRequest:
     )
 
 
-class FakeHttp:
-    """Answers what a test wants, and remembers what it was asked."""
-
-    def __init__(self, *answers: Answer | Exception) -> None:
-        self._answers = iter(answers)
-        self.tokens: list[str] = []
-        self.max_bytes = 0
-        self.closed = False
-
-    async def request(
-        self, method: str, path: str, headers: Mapping[str, str], body: bytes, timeout_s: float, max_bytes: int
-    ) -> Answer:
-        self.tokens.append(headers["Authorization"])
-        self.max_bytes = max_bytes
-        answer = next(self._answers)
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
-
-    async def close(self) -> None:
-        self.closed = True
+def client_of(handler: Callable[[httpx.Request], httpx.Response]) -> MasterClient:
+    return MasterClient("http://master:1", lambda: TOKEN, transport=httpx.MockTransport(handler))
 
 
-def client_of(*answers: Answer | Exception) -> MasterClient:
-    return MasterClient("http://master:1", lambda: TOKEN, http=FakeHttp(*answers))
+async def refused(answer: httpx.Response) -> UplinkError | WireError:
+    async with client_of(lambda _: answer) as client:
+        with pytest.raises((UplinkError, WireError)) as caught:
+            await client.update(update())
+    return caught.value
 
 
 async def test_a_refusal_has_its_status_and_reason() -> None:
-    async with client_of(Answer(409, b'{"detail":"unit 1: this session is over"}')) as client:
-        with pytest.raises(MasterRefused) as caught:
-            await client.update(update())
-    assert caught.value.status == 409
-    assert str(caught.value) == "http://master:1/update: 409: unit 1: this session is over"
+    error = await refused(httpx.Response(409, json={"detail": "unit 1: this session is over"}))
+    assert isinstance(error, MasterRefused)
+    assert error.status == 409
+    assert str(error) == "http://master:1/update: 409: unit 1: this session is over"
 
 
-async def test_a_long_reason_is_cut() -> None:
-    async with client_of(Answer(500, b"\xff" * 100_000)) as client:
-        with pytest.raises(MasterRefused) as caught:
-            await client.update(update())
-    assert len(str(caught.value)) < 400
+async def test_nonsense_is_a_wire_error() -> None:
+    assert isinstance(await refused(httpx.Response(200, content=b"<html>")), WireError)
+    assert isinstance(await refused(httpx.Response(200, content=b"\0" * (MAX_ANSWER_BYTES + 1))), WireError)
 
 
-@pytest.mark.parametrize("answer", [Answer(200, b"<html>"), Answer(200, b""), Answer(200, b"\x80")])
-async def test_nonsense_is_a_wire_error(answer: Answer) -> None:
-    async with client_of(answer) as client:
-        with pytest.raises(WireError):
-            await client.update(update())
+SILENCE = (httpx.ConnectError("no route"), httpx.ReadTimeout(""), httpx.RemoteProtocolError("x"))
 
 
-async def test_a_redirection_is_not_followed() -> None:
-    async with client_of(Answer(307, b"")) as client:
-        with pytest.raises(MasterRefused, match="307"):
+@pytest.mark.parametrize("error", SILENCE)
+async def test_a_silent_master_is_unreachable(error: httpx.HTTPError) -> None:
+    def handler(_: httpx.Request) -> httpx.Response:
+        raise error
+
+    async with client_of(handler) as client:
+        with pytest.raises(MasterUnreachable, match="http://master:1/update: "):
             await client.update(update())
 
 
-async def test_a_silent_master_is_unreachable() -> None:
-    async with client_of(MasterUnreachable("no answer")) as client:
-        with pytest.raises(MasterUnreachable, match="no answer"):
-            await client.update(update())
-
-
-async def test_the_token_is_read_anew_when_asked_and_the_connections_closed() -> None:
+async def test_the_token_is_read_anew_when_asked() -> None:
     tokens = iter(("first-token-0123456789", "second-token-0123456789"))
-    http = FakeHttp(*[Answer(404, b"gone")] * 3)
-    async with MasterClient("http://master:1", lambda: next(tokens), http=http) as client:
+    seen = []
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        seen.append(request.headers["authorization"])
+        return httpx.Response(404, text="gone")
+
+    async with MasterClient(
+        "http://master:1", lambda: next(tokens), transport=httpx.MockTransport(handler)
+    ) as client:
         for _ in range(2):
             with pytest.raises(MasterRefused):
                 await client.update(update())
         await client.authorize()
         with pytest.raises(MasterRefused):
             await client.update(update())
-    assert http.tokens == ["Bearer first-token-0123456789"] * 2 + ["Bearer second-token-0123456789"]
-    assert http.closed
+    assert seen == ["Bearer first-token-0123456789"] * 2 + ["Bearer second-token-0123456789"]
 
 
-async def test_a_mesh_may_be_longer_than_other_answers() -> None:
-    http = FakeHttp(Answer(200, b"mesh"), Answer(200, b"\xc0"))
-    async with MasterClient("http://master:1", lambda: TOKEN, http=http) as client:
-        assert await client.mesh("0" * 64) == b"mesh"
-        assert http.max_bytes == MAX_MESH_BYTES
-        with pytest.raises(WireError):
-            await client.robot(0, 1.0)
-        assert http.max_bytes == MAX_ANSWER_BYTES
+async def test_a_mesh_that_is_too_long_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("edge_unit.client.MAX_MESH_BYTES", 1000)
+    assert MAX_MESH_BYTES > 10**6
+    async with client_of(lambda _: httpx.Response(200, content=b"\0" * 1001)) as client:
+        with pytest.raises(WireError, match="at most 1000 bytes"):
+            await client.mesh("0" * 64)
 
 
 async def test_a_cell_that_is_no_document_is_refused() -> None:
-    async with client_of(Answer(200, b"\x93\x01\x02\x03")) as client:
+    async with client_of(lambda _: httpx.Response(200, content=b"\x93\x01\x02\x03")) as client:
         with pytest.raises(WireError, match="expected a document"):
             await client.cell_document()
+
+
+def test_a_master_without_a_host_is_refused() -> None:
+    with pytest.raises(ConfigError, match="master_url"):
+        MasterClient("http://", lambda: TOKEN)
 
 
 @pytest.mark.parametrize("count", [0, 100, 1000])

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from edge_unit import unit as unit_module
 from edge_unit import uplink as uplink_module
 from edge_unit.client import MasterClient
 from edge_unit.config import PoseConfig, UnitConfig
-from edge_unit.http import Answer
 from edge_unit.sources.frame import CameraInfo, DepthFrame
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from edge_unit.trace import read_trace
@@ -79,28 +78,6 @@ class FakeSource:
         self.closed += 1
 
 
-class InProcess:
-    """Carries requests to an application without a network."""
-
-    def __init__(self, app: Callable[[], Any]) -> None:
-        self._app = app
-
-    async def request(
-        self, method: str, path: str, headers: Mapping[str, str], body: bytes, timeout_s: float, max_bytes: int
-    ) -> Answer:
-        # Shielded, for a cancellation is the unit's affair and must not reach into the master.
-        response = await asyncio.shield(self._respond(method, path, dict(headers), body))
-        return Answer(response.status_code, response.content)
-
-    async def _respond(self, method: str, path: str, headers: dict[str, str], body: bytes) -> httpx.Response:
-        transport = httpx.ASGITransport(app=self._app(), client=(IP, 40_000))
-        async with httpx.AsyncClient(transport=transport, base_url="http://master") as client:
-            return await client.request(method, path, headers=headers, content=body)
-
-    async def close(self) -> None:
-        """Nothing is open."""
-
-
 class Bench:
     """One master, one unit, one source."""
 
@@ -118,12 +95,13 @@ class Bench:
         self.app = make_app(master, Access(TOKEN.encode(), b"operator-token-0123456789"))
 
     def make_unit(self) -> Unit:
-        client = MasterClient("http://master", lambda: TOKEN, http=InProcess(lambda: self.app))
+        transport = httpx.ASGITransport(app=lambda *call: self.app(*call), client=(IP, 40_000))
+        client = MasterClient("http://master", lambda: TOKEN, transport=transport)
         return Unit(self.config, self.source, client)
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[asyncio.Task[None]]:
-        self.task = task = asyncio.create_task(self.unit.run())
+        task = asyncio.create_task(self.unit.run())
         try:
             yield task
         finally:
@@ -145,8 +123,6 @@ class Bench:
     async def until(self, look: Callable[[], Any], what: str, timeout_s: float = 20.0) -> Any:
         deadline_ns = monotonic_ns() + round(timeout_s * 1e9)
         while not (found := look()):
-            if self.task.done():
-                await self.task
             assert monotonic_ns() < deadline_ns, f"{what}: {self.row()}"
             await asyncio.sleep(0.002)
         return found

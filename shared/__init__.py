@@ -6,6 +6,7 @@ In the order of the flow:
     errors         the one tree of errors that the project raises
     configuration  YAML, environment and command line as one configuration
     clock          the only place that reads the time
+    waiting        waiting with a limit, without losing a cancellation
     transforms     rigid transforms `T_a_b` as (4, 4) matrices
     camera         pinhole intrinsics of a depth camera
     lattice        the voxel grid that the whole cell shares

@@ -35,19 +35,29 @@ def plug(sockets: Path, recordings: Iterable[Path]) -> None:
     written.rename(sockets)
 
 
-def follow(sockets: Path, context: rs.context) -> None:
-    """Plug in and out as the file says, for ever."""
-    plugged: dict[str, object] = {}
-    pause = threading.Event()
-    while True:
-        wanted = sockets.read_text().split() if sockets.is_file() else []
-        for path in plugged.keys() - set(wanted):
-            context.unload_device(path)
-            del plugged[path]
-        for path in set(wanted) - plugged.keys():
+class Sockets:
+    """What is plugged in, on a context."""
+
+    def __init__(self, sockets: Path, context: rs.context) -> None:
+        self._sockets = sockets
+        self._context = context
+        self._plugged: dict[str, object] = {}
+
+    def look(self) -> None:
+        """Plug in and out as the file says."""
+        wanted = self._sockets.read_text().split() if self._sockets.is_file() else []
+        for path in self._plugged.keys() - set(wanted):
+            self._context.unload_device(path)
+            del self._plugged[path]
+        for path in set(wanted) - self._plugged.keys():
             # The SDK forgets a device that nobody holds.
-            plugged[path] = context.load_device(path)
-        pause.wait(LOOK_EVERY_S)
+            self._plugged[path] = self._context.load_device(path)
+
+    def follow(self) -> None:
+        """Look for ever."""
+        pause = threading.Event()
+        while not pause.wait(LOOK_EVERY_S):
+            self.look()
 
 
 def serve(end: socket.socket) -> None:
@@ -56,8 +66,10 @@ def serve(end: socket.socket) -> None:
     if received is None or not isinstance(received[0], link.Request):
         return
     context = rs.context()
+    sockets = Sockets(Path(sys.argv[1]), context)
+    sockets.look()
     capture = Capture(end, replace(received[0], loop=True), context)
-    threading.Thread(target=follow, args=(Path(sys.argv[1]), context), name="sockets", daemon=True).start()
+    threading.Thread(target=sockets.follow, name="sockets", daemon=True).start()
     capture.run()
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from edge_unit.sources import capture_link as link
 from edge_unit.sources.shared_frames import SharedFrames
 from shared.errors import SourceError
+from shared.waiting import within
 
 CAPTURE_COMMAND = (sys.executable, "-m", "edge_unit.sources.capture_process")
 """Takes the descriptor of its end of the link and the id of the process that it must not outlive."""
@@ -93,15 +94,13 @@ class CaptureSession:
 
     async def wait(self, timeout_s: float) -> None:
         """Until something new is heard, but no longer than `timeout_s`."""
-        with suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(self.heard.wait(), timeout_s)
+        await within(timeout_s, self.heard.wait())
         self.heard.clear()
 
     async def stop(self) -> None:
         """Ask it to end in good order, and see that it does."""
         self.tell(link.Stop())
-        with suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(self._process.wait(), STOP_S)
+        await within(STOP_S, self._process.wait())
         await self.kill()
 
     async def kill(self) -> str:
@@ -111,16 +110,15 @@ class CaptureSession:
             # Not by the process object: it would reap the process under asyncio's hands.
             with suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
-        try:
-            status = await asyncio.wait_for(self._process.wait(), KILL_S)
-        except asyncio.TimeoutError:
-            return f"process {self.pid} is held in the kernel; unplug the camera"
+        await within(KILL_S, self._process.wait())
+        status = self._process.returncode
+        if status is None:
+            return f"nothing: process {self.pid} is held in the kernel; unplug the camera"
         return f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
 
     async def ended(self) -> str:
         """How a process that has closed its link ended."""
-        with suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(self._process.wait(), STOP_S)
+        await within(STOP_S, self._process.wait())
         return await self.kill()
 
     def _read(self) -> None:

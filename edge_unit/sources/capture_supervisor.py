@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import AsyncIterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 
 from edge_unit.sources import capture_link as link
@@ -19,6 +18,7 @@ from edge_unit.sources.status import SourceState, StatusBoard
 from edge_unit.sources.watchdog import Watchdog
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import SourceError
+from shared.waiting import within
 
 logger = logging.getLogger(__name__)
 
@@ -73,8 +73,7 @@ class CaptureSupervisor:
         Raises:
             SourceError: it does not within `timeout_s`; says why.
         """
-        with suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(self._known.wait(), timeout_s)
+        await within(timeout_s, self._known.wait())
         if self.failure is not None:
             raise self.failure
         if self.opened is None:

@@ -51,10 +51,17 @@ async def opened(**config: Any) -> AsyncIterator[tuple[RealsenseSource, CameraIn
 
 
 async def until(source: RealsenseSource, wanted: Callable[[SourceStatus], bool]) -> SourceStatus:
-    status = source.status
-    while not wanted(status):
-        status = await asyncio.wait_for(source.next_status(status), 10.0)
-    return status
+    seen = [source.status]
+
+    async def look() -> None:
+        while not wanted(seen[-1]):
+            seen.append(await source.next_status(seen[-1]))
+
+    try:
+        await asyncio.wait_for(look(), 10.0)
+    except asyncio.TimeoutError:
+        pytest.fail("\n".join(str(status) for status in seen))
+    return seen[-1]
 
 
 def check(frame: DepthFrame) -> None:
@@ -284,7 +291,7 @@ async def test_a_camera_may_be_unplugged_and_plugged_in_again(recording: Path, t
     await asyncio.sleep(0.2)
     await source.close()
     await asyncio.wait_for(reading, 1.0)
-    assert len(numbers) > 5
+    assert len(numbers) >= 3
     assert numbers == sorted(set(numbers))
 
 

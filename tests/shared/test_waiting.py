@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Waiting with a limit."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from shared.waiting import within
+
+
+async def test_done_or_not() -> None:
+    event = asyncio.Event()
+    assert not await within(0.01, event.wait())
+    event.set()
+    assert await within(0.01, event.wait())
+
+
+async def test_errors_are_raised() -> None:
+    async def fail() -> None:
+        raise LookupError("nothing there")
+
+    with pytest.raises(LookupError, match="nothing there"):
+        await within(1.0, fail())
+
+
+async def test_a_cancellation_that_arrives_together_with_the_event_is_not_lost() -> None:
+    event = asyncio.Event()
+
+    async def wait_for_ever() -> None:
+        while True:
+            await within(1.0, event.wait())
+            event.clear()
+
+    task = asyncio.create_task(wait_for_ever())
+    await asyncio.sleep(0.01)
+    event.set()
+    # One turn of the loop later the waiting is done and not yet told: here `asyncio.wait_for` loses the cancellation.
+    for _ in range(2):
+        await asyncio.sleep(0)
+    task.cancel()
+    done, _ = await asyncio.wait({task}, timeout=1.0)
+    assert done
+    assert task.cancelled()
+
+
+async def test_what_is_not_done_in_time_is_cancelled() -> None:
+    cancelled = asyncio.Event()
+
+    async def work() -> None:
+        try:
+            await asyncio.sleep(10.0)
+        finally:
+            cancelled.set()
+
+    assert not await within(0.01, work())
+    await asyncio.sleep(0)
+    assert cancelled.is_set()

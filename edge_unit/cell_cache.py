@@ -25,15 +25,18 @@ class CellCache:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self._last: Cell | None = None
 
     async def get(self, reference: CellReference, client: MasterClient) -> Cell:
-        """The cell that the master watches, from disk as far as it is there.
+        """The cell that the master watches, from disk as far as it is there; the same object while it does not change.
 
         Raises:
             UplinkError: the master does not give it.
             WireError: what it gives is not that cell.
             CellError: it is no cell.
         """
+        if self._last is not None and self._last.version == reference.sha256:
+            return self._last
         document = await asyncio.to_thread(self._read_document, reference.sha256)
         fetched = document is None
         if document is None:
@@ -57,6 +60,7 @@ class CellCache:
             raise
         if fetched:
             await asyncio.to_thread(self._keep, reference.sha256, document, set(meshes))
+        self._last = cell
         return cell
 
     def _read_document(self, sha256: str) -> dict[str, Any] | None:

@@ -112,13 +112,15 @@ class UnitConfig(Configured):
             ConfigError: there is none, or its file cannot be read.
         """
         if self.token is not None:
-            return self.token.get_secret_value()
-        if self.token_file is None:
+            where, token = "token", self.token.get_secret_value()
+        elif self.token_file is not None:
+            where = f"token_file {self.token_file}"
+            try:
+                token = self.token_file.read_text(encoding="ascii").strip()
+            except (OSError, UnicodeDecodeError) as error:
+                raise ConfigError(f"{where}: cannot be read: {error}") from error
+        else:
             raise ConfigError("token: expected token or token_file in the configuration, got neither")
-        try:
-            token = self.token_file.read_text(encoding="ascii").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"token_file {self.token_file}: cannot be read: {error}") from error
-        if not token:
-            raise ConfigError(f"token_file {self.token_file}: expected a token, got an empty file")
+        if not token or not token.isascii() or not token.isprintable():
+            raise ConfigError(f"{where}: expected a token in one line of plain characters, got something else")
         return token

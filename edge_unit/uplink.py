@@ -36,6 +36,7 @@ from shared.messages import (
 from shared.settings import Settings
 from shared.timebase import ClockOffset, Exchange
 from shared.transforms import Transform, validated
+from shared.waiting import within
 from shared.wire import pack_seen
 
 logger = logging.getLogger(__name__)
@@ -146,9 +147,7 @@ class Uplink:
 
     async def drained(self, timeout_s: float) -> None:
         """Wait until nothing is left to be sent, but no longer than `timeout_s`."""
-        try:
-            await asyncio.wait_for(self._idle.wait(), timeout_s)
-        except asyncio.TimeoutError:
+        if not await within(timeout_s, self._idle.wait()):
             logger.warning("the last frame did not reach the master")
 
     async def refresh_joints(self, at_master_ns: int) -> None:
@@ -242,8 +241,7 @@ class Uplink:
         try:
             answer, merged_at_ns = await self._exchange_update(assignment, report)
         except CellwatchError:
-            if fresh is not None:
-                self._on_sent(fresh, None)
+            self._put_back(fresh)
             raise
         finally:
             if self._fresh is None:
@@ -251,6 +249,13 @@ class Uplink:
         if fresh is not None:
             self._on_sent(fresh, merged_at_ns)
         await self._follow(assignment, answer)
+
+    def _put_back(self, report: Report | None) -> None:
+        """What could not be sent is tried again, unless a newer one came meanwhile."""
+        if self._fresh is None:
+            self._fresh = report
+        elif report is not None:
+            self._on_sent(report, None)
 
     async def _exchange_update(self, assignment: Assignment, report: Report) -> tuple[UpdateAnswer, int]:
         self._sequence += 1
@@ -303,7 +308,9 @@ class Uplink:
         if answer.versions.pose != assignment.versions.pose:
             pose = answer.T_world_camera
             changed = replace(changed, T_world_camera=None if pose is None else validated(pose, "T_world_camera"))
-        self._assign(changed)
+        if self.assignment is assignment:
+            # Otherwise the camera was changed meanwhile, and this session is over.
+            self._assign(changed)
 
     def _accept_commands(self, commands: Iterable[Command]) -> None:
         for command in commands:

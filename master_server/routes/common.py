@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 from collections.abc import Callable, Coroutine
 from typing import Annotated, Any
@@ -18,6 +17,7 @@ from starlette.types import Message, Scope
 from master_server.access import OPERATORS, UNITS, Access, Role
 from master_server.master import Master
 from shared.errors import Refusal, WireError
+from shared.waiting import within
 from shared.wire import MEDIA_TYPE, unpack
 
 MAX_BODY_BYTES = 2**18
@@ -39,12 +39,13 @@ async def body_of(request: Request, max_bytes: int) -> bytes:
     declared = request.headers.get("content-length", "0")
     if declared.isdigit() and int(declared) > max_bytes:
         raise Refusal(413, f"body: expected at most {max_bytes} bytes, got {declared}")
+    body = bytearray()
     try:
-        return await asyncio.wait_for(_read(request, max_bytes), BODY_TIMEOUT_S)
-    except asyncio.TimeoutError as error:
-        raise Refusal(408, f"body: expected all of it within {BODY_TIMEOUT_S:g} s") from error
+        if not await within(BODY_TIMEOUT_S, _read(request, max_bytes, body)):
+            raise Refusal(408, f"body: expected all of it within {BODY_TIMEOUT_S:g} s, got {len(body)} bytes")
     except ClientDisconnect as error:
         raise Refusal(400, "body: the sender went away") from error
+    return bytes(body)
 
 
 def ip_of(scope: Scope) -> str:
@@ -130,13 +131,11 @@ OPERATOR_ONLY = [bearer, Depends(is_operator)]
 UNIT_ONLY = [bearer, Depends(is_unit)]
 
 
-async def _read(request: Request, max_bytes: int) -> bytes:
-    chunks = bytearray()
+async def _read(request: Request, max_bytes: int, body: bytearray) -> None:
     async for chunk in request.stream():
-        chunks += chunk
-        if len(chunks) > max_bytes:
+        body += chunk
+        if len(body) > max_bytes:
             raise Refusal(413, f"body: expected at most {max_bytes} bytes, got more")
-    return bytes(chunks)
 
 
 async def _as_json(request: Request) -> Request:

@@ -53,6 +53,13 @@ async def test_a_cell_is_fetched_once(tmp_path: Path) -> None:
     assert master.asked == []
 
 
+async def test_a_cell_that_did_not_change_is_the_same_object(tmp_path: Path) -> None:
+    master = FakeMaster(await asyncio.to_thread(cell, "one", 0.1))
+    cache = CellCache(tmp_path)
+    first = await cache.get(master.reference, master)  # type: ignore[arg-type]
+    assert await cache.get(master.reference, master) is first  # type: ignore[arg-type]
+
+
 async def test_of_a_changed_cell_only_what_is_new_is_fetched_and_the_old_forgotten(tmp_path: Path) -> None:
     old = FakeMaster(await asyncio.to_thread(cell, "one", 0.1, 0.2))
     new = FakeMaster(await asyncio.to_thread(cell, "one", 0.1, 0.3))

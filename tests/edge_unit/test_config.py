@@ -84,9 +84,10 @@ def test_a_token_file_is_read_anew_each_time(tmp_path: Path) -> None:
     for text in ("one\n", "two"):
         path.write_text(text)
         assert config.read_token() == text.strip()
-    path.write_text("\n")
-    with pytest.raises(ConfigError, match="got an empty file"):
-        config.read_token()
+    for text in ("\n", "one\ntwo", "a\x00b"):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match="in one line of plain characters"):
+            config.read_token()
 
 
 def test_without_a_token_it_says_so() -> None:

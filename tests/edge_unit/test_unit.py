@@ -101,7 +101,7 @@ class Bench:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[asyncio.Task[None]]:
-        task = asyncio.create_task(self.unit.run())
+        self.task = task = asyncio.create_task(self.unit.run())
         try:
             yield task
         finally:
@@ -123,6 +123,8 @@ class Bench:
     async def until(self, look: Callable[[], Any], what: str, timeout_s: float = 20.0) -> Any:
         deadline_ns = monotonic_ns() + round(timeout_s * 1e9)
         while not (found := look()):
+            if self.task.done():
+                await self.task
             assert monotonic_ns() < deadline_ns, f"{what}: {self.row()}"
             await asyncio.sleep(0.002)
         return found

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import importlib.metadata
 import logging
 from collections.abc import AsyncGenerator
@@ -363,6 +364,9 @@ def _warm_up(pipeline: DepthPipeline) -> None:
     pipeline.process(np.zeros(pipeline.intrinsics.shape, np.uint16), joints)
     pipeline.health()
     pipeline.seen()
+    # What is there now stays; without this, each full collection looks through it, and a frame waits 0.1 s.
+    gc.collect()
+    gc.freeze()
 
 
 def _report(pipeline: DepthPipeline, assignment: Assignment, frame: DepthFrame, joints: JointEstimate | None) -> Report:

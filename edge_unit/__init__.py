@@ -9,6 +9,7 @@ In the order of the flow:
     recording       a folder of images becomes a recording that the RealSense SDK plays
     inflation       how a mesh grows by a padding
     hull            a link as the solid that reaches a few centimetres around it
+    drawing         meshes and links drawn into buffers of inverse depth
     expected_depth  what the camera should see: static layer and robot layer (Algorithms 2 to 5)
     halo            what edges of the CAD make the camera see beside them
     reference       the static layer that is learned from the empty cell
@@ -25,6 +26,8 @@ In the order of the flow:
     trace           what was reported, frame by frame, in a file
     config          the unit's own configuration
     unit            the daemon: source, pipeline and uplink held together
+    board           what the board itself tells: its clock, its USB
+    doctor          is all there that a unit needs, and what is to be done if not
     __main__        the command line
 """
 

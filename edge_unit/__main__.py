@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`edge-unit run CONFIG.YAML`: watch with one camera until told to stop."""
+"""The command line: `run` watches until told to stop, `doctor` looks for what is wrong, `record-images` records."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
 
 from edge_unit.config import ENVIRONMENT_PREFIX, UnitConfig
 from edge_unit.jit_cache import settle
+from edge_unit.sources.recorded import RecordedSourceConfig
 from shared.configuration import assignments, load
 from shared.errors import CellwatchError
 
@@ -27,18 +28,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # One line for each request would fill the journal.
     logging.getLogger("httpx").setLevel(logging.WARNING)
     logging.getLogger("httpcore").setLevel(logging.WARNING)
+    command: Callable[[argparse.Namespace], int] = options.command
     try:
-        config = load(UnitConfig, options.config, os.environ, ENVIRONMENT_PREFIX, assignments(options.set))
-        config.read_token()
-        if config.jit_cache_dir is not None:
-            settle(config.jit_cache_dir)
-        # Imported only now, for kernels settle where they are kept when they are imported.
-        from edge_unit.unit import Unit, make_source
-
-        asyncio.run(_until_told_to_stop(Unit(config, make_source(config.source)).run()))
+        return command(options)
     except CellwatchError as error:
         print(f"edge-unit: {error}", file=sys.stderr)
         return 1
+
+
+def _run(options: argparse.Namespace) -> int:
+    config = load(UnitConfig, options.config, os.environ, ENVIRONMENT_PREFIX, assignments(options.set))
+    config.read_token()
+    if config.jit_cache_dir is not None:
+        settle(config.jit_cache_dir)
+    # Imported only now, for kernels settle where they are kept when they are imported.
+    from edge_unit.unit import Unit, make_source
+
+    asyncio.run(_until_told_to_stop(Unit(config, make_source(config.source)).run()))
+    return 0
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    """Print what is found as it is found; 1 when anything fails."""
+    from edge_unit.doctor import Finding, examine
+
+    overrides: dict[str, object] = {**assignments(options.set)}
+    if options.config is None and not any(name.startswith(f"{ENVIRONMENT_PREFIX}SOURCE") for name in os.environ):
+        overrides = {"source.kind": "realsense", **overrides}
+    config = load(UnitConfig, options.config, os.environ, ENVIRONMENT_PREFIX, overrides)
+
+    async def report() -> list[Finding]:
+        findings = []
+        async for finding in examine(config, options.seconds):
+            print(finding, flush=True)
+            findings.append(finding)
+        return findings
+
+    return int(any(finding.level == "FAIL" for finding in asyncio.run(report())))
+
+
+def _record_images(options: argparse.Namespace) -> int:
+    from edge_unit.recording import record_images
+
+    images = load(RecordedSourceConfig, None, {}, "", {"folder": options.folder, **assignments(options.set)})
+    count = record_images(images, options.recording, options.fps)
+    print(f"{options.recording}: {count} frames")
     return 0
 
 
@@ -57,16 +91,27 @@ async def _until_told_to_stop(work: Coroutine[None, None, None]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="edge-unit", description="The edge unit: one depth camera, one master.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    run = commands.add_parser(
-        "run",
-        help="watch and report until told to stop",
-        epilog=f"Every value may also be a variable, as in {ENVIRONMENT_PREFIX}MASTER_URL=http://10.0.0.2:8420.",
-    )
-    run.add_argument("config", type=Path, nargs="?", metavar="CONFIG.YAML", help="the unit's configuration")
-    run.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="one value of it, as in source.fps=15"
-    )
-    run.add_argument("--log-level", default="INFO", choices=("DEBUG", "INFO", "WARNING", "ERROR"))
+    variables = f"Every value may also be a variable, as in {ENVIRONMENT_PREFIX}MASTER_URL=http://10.0.0.2:8420."
+    run = commands.add_parser("run", help="watch and report until told to stop", epilog=variables)
+    run.set_defaults(command=_run)
+    doctor = commands.add_parser("doctor", help="tell what is missing or wrong, and what to do", epilog=variables)
+    doctor.set_defaults(command=_doctor)
+    doctor.add_argument("--seconds", type=float, default=3.0, help="how long to watch the camera (default 3)")
+    for each in (run, doctor):
+        each.add_argument("config", type=Path, nargs="?", metavar="CONFIG.YAML", help="the unit's configuration")
+    record = commands.add_parser("record-images", help="make a recording for the RealSense SDK from depth images")
+    record.set_defaults(command=_record_images)
+    record.add_argument("folder", metavar="DIR", help="16-bit PNG or npz images in depth/, with camera_info.yaml")
+    record.add_argument("recording", type=Path, metavar="OUT.db3")
+    record.add_argument("--fps", type=float, default=15.0, help="its pace, also that of writing it (default 15)")
+    for each in (run, doctor, record):
+        each.add_argument(
+            "--set", action="append", default=[], metavar="NAME=VALUE", help="one value of the configuration"
+        )
+    levels = ("DEBUG", "INFO", "WARNING", "ERROR")
+    run.add_argument("--log-level", default="INFO", choices=levels)
+    doctor.add_argument("--log-level", default="ERROR", choices=levels)
+    record.add_argument("--log-level", default="WARNING", choices=levels)
     return parser
 
 

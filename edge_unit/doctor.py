@@ -1,0 +1,382 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`edge-unit doctor`: is all there that a unit needs, and if not, what is to be done; for a person with a board.
+
+Nothing is changed anywhere: the master is asked, but not registered at.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.metadata
+import platform
+import tempfile
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_unit.board import clock_is_set, usb_cameras
+from edge_unit.cell_cache import mesh_hashes
+from edge_unit.client import MasterClient
+from edge_unit.config import UnitConfig
+from edge_unit.jit_cache import settle
+from edge_unit.sources import capture_link as link
+from edge_unit.sources.capture_session import CaptureSession
+from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
+from edge_unit.sources.realsense import RealsenseSource, RealsenseSourceConfig
+from shared.cell import Cell
+from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns, wall_ns
+from shared.errors import CellwatchError, ConfigError, MasterRefused, SourceError
+from shared.messages import UpdateRequest, Versions
+from shared.settings import FilterSettings
+from shared.transforms import Transform, look_at
+from shared.waiting import within
+
+Level = Literal["ok", "warning", "FAIL"]
+
+MEASURE_S = 3.0
+"""Long enough for the rate of frames to be told to a few per cent."""
+
+KEPT_FRAMES = 10
+"""Of those measured, for the pipeline to work on."""
+
+RATE_OK, RATE_POOR = 0.9, 0.5
+"""Shares of the wanted rate."""
+
+VALID_OK = 0.3
+"""Share of pixels that measure anything; a camera that looks into a cell has twice that."""
+
+BUDGET_OK = 0.7
+"""Share of a frame's period that processing it may take, so that the rest of the board has air."""
+
+ROUND_TRIP_OK_MS = 20.0
+"""Half of it is how far the robot's joints may be off in time: at 1 rad/s and 1 m reach, a centimetre."""
+
+SURVEY_S = 15.0
+"""For the SDK to look for cameras."""
+
+NOBODY = 2**62
+"""An id that no unit has."""
+
+EPOCH_NS = 1_735_689_600 * NS_PER_S
+"""2025-01-01: a clock that shows less was never set."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report; `text` says what was found and, unless it is ok, what to do."""
+
+    level: Level
+    what: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.level:<8} {self.what:<9} {self.text}"
+
+
+@dataclass
+class Measured:
+    """What a source delivered while it was watched."""
+
+    numbers: list[int] = field(default_factory=list)
+    captured_ns: list[int] = field(default_factory=list)
+    ages_ms: list[float] = field(default_factory=list)
+    depth: list[NDArray[np.uint16]] = field(default_factory=list)
+
+    @property
+    def fps(self) -> float:
+        """Frames that the camera took in a second, those included that were passed over."""
+        span_ns = self.captured_ns[-1] - self.captured_ns[0] if self.captured_ns else 0
+        return (self.numbers[-1] - self.numbers[0]) * NS_PER_S / span_ns if span_ns > 0 else 0.0
+
+
+async def examine(config: UnitConfig, seconds: float = MEASURE_S) -> AsyncIterator[Finding]:
+    """Look at one thing after the other, each as soon as it is known."""
+    yield await asyncio.to_thread(software)
+    yield clock()
+    cell: Cell | None = None
+    async for found in _master(config):
+        if isinstance(found, Cell):
+            cell = found
+        else:
+            yield found
+    source = config.source
+    if isinstance(source, RealsenseSourceConfig):
+        async for finding in _cameras(source):
+            yield finding
+            if finding.level == "FAIL":
+                return
+    measured = Measured()
+    info: CameraInfo | None = None
+    camera, settled = await asyncio.to_thread(_source, config)
+    try:
+        info = await camera.open()
+        await within(seconds, _watch(camera, measured))
+    except SourceError as error:
+        yield Finding("FAIL", "stream", str(error))
+    finally:
+        wanted_fps = _wanted_fps(camera, config)
+        warning = camera.status.warning if isinstance(camera, RealsenseSource) else ""
+        await camera.close()
+    if info is None:
+        return
+    if warning:
+        yield Finding("warning", "profile", warning)
+    for finding in stream(info, measured, wanted_fps):
+        yield finding
+    for finding in await asyncio.to_thread(_pipeline, config, info, cell, measured, wanted_fps, settled):
+        yield finding
+
+
+def software() -> Finding:
+    """What runs here."""
+    version = importlib.metadata.version("cellwatch")
+    return Finding("ok", "software", f"cellwatch {version}, Python {platform.python_version()}, {platform.machine()}")
+
+
+def clock() -> Finding:
+    """The wall clock, which people read in logs; units and master count by clocks that are never set."""
+    if wall_ns() < EPOCH_NS:
+        return Finding("warning", "clock", "it was never set, so the times in logs are wrong; start an NTP service")
+    if not clock_is_set():
+        return Finding("warning", "clock", "no NTP service sets it; times in logs may be off (frames are not)")
+    return Finding("ok", "clock", "set by NTP")
+
+
+def stream(info: CameraInfo, measured: Measured, wanted_fps: float | None) -> Iterator[Finding]:
+    """What a camera delivers."""
+    lens = info.intrinsics
+    if len(measured.numbers) < 2:
+        yield Finding("FAIL", "stream", f"{info.model} {info.serial} was opened and delivered no frames")
+        return
+    rate = f"{lens.width}x{lens.height} at {measured.fps:.1f} fps, {np.median(measured.ages_ms):.0f} ms old on arrival"
+    share = 1.0 if wanted_fps is None else measured.fps / wanted_fps
+    if share >= RATE_OK:
+        yield Finding("ok", "stream", rate)
+    else:
+        advice = "more light (exposure is longer than a frame), a port and cable of its own, or a lower fps"
+        level: Level = "warning" if share >= RATE_POOR else "FAIL"
+        yield Finding(level, "stream", f"{rate}, {wanted_fps:g} are wanted: try {advice}")
+    valid = float(np.mean([np.count_nonzero(depth) / depth.size for depth in measured.depth]))
+    if valid >= VALID_OK:
+        yield Finding("ok", "depth", f"{valid:.0%} of the pixels measure something")
+    else:
+        yield Finding(
+            "warning", "depth", f"only {valid:.0%} of the pixels measure anything; is the lens free and the cell lit?"
+        )
+
+
+async def _master(config: UnitConfig) -> AsyncIterator[Finding | Cell]:
+    """Whether the master is there and takes our token; the cell that it watches, if it gives it."""
+    try:
+        client = MasterClient(config.master_url, config.read_token, config.source_address)
+        await asyncio.to_thread(config.read_token)
+    except ConfigError as error:
+        yield Finding("FAIL", "token", f"{error}; copy the master's unit.token to this board")
+        return
+    async with client:
+        try:
+            asked_ns = monotonic_ns()
+            await client.robot(0, MEASURE_S)
+            first_ns, asked_ns = monotonic_ns() - asked_ns, monotonic_ns()
+            await client.robot(0, MEASURE_S)
+            trip_ms = min(first_ns, monotonic_ns() - asked_ns) / NS_PER_MS
+        except MasterRefused as error:
+            yield Finding("FAIL", "token", f"{error}; copy the master's unit.token to this board")
+            return
+        except CellwatchError as error:
+            yield Finding("FAIL", "master", f"{error}; is it running, and is master_url right?")
+            return
+        if trip_ms <= ROUND_TRIP_OK_MS:
+            yield Finding("ok", "master", f"{client.url} answers within {trip_ms:.1f} ms")
+        else:
+            yield Finding(
+                "warning", "master", f"{client.url} takes {trip_ms:.0f} ms to answer; use a cable, not a radio network"
+            )
+        yield await _token(client)
+        try:
+            document = await client.cell_document()
+            meshes = {sha256: await client.mesh(sha256) for sha256 in mesh_hashes(document)}
+            cell = await asyncio.to_thread(Cell.from_document, document, meshes)
+        except CellwatchError as error:
+            yield Finding("FAIL", "cell", str(error))
+            return
+        yield Finding("ok", "cell", f"{cell.name}, {len(cell.static) + len(cell.objects)} known bodies")
+        yield cell
+
+
+async def _token(client: MasterClient) -> Finding:
+    """Whether the token is a unit's: an update of a unit that does not exist is refused for that reason, or another."""
+    update = UpdateRequest(id=NOBODY, session=0, sequence=0, sent_at_ns=monotonic_ns(), versions=Versions())
+    try:
+        await client.update(update)
+    except MasterRefused as error:
+        if error.status not in (401, 403):
+            return Finding("ok", "token", "accepted")
+        return Finding("FAIL", "token", f"{error}; copy the master's unit.token to this board")
+    except CellwatchError as error:
+        return Finding("FAIL", "token", str(error))
+    return Finding("warning", "token", "the master took an update of a unit that does not exist; is it ours?")
+
+
+async def _cameras(source: RealsenseSourceConfig) -> AsyncIterator[Finding]:
+    """The SDK, and the cameras that it sees."""
+    try:
+        found = await _survey()
+    except SourceError as error:
+        yield Finding("FAIL", "sdk", str(error))
+        return
+    yield Finding("ok", "sdk", f"RealSense SDK {found.sdk}")
+    if source.recording is not None:
+        yield Finding("ok", "camera", f"none is needed, {source.recording} is played")
+        return
+    for device in found.devices:
+        yield Finding("ok", "camera", f"{device['model']}, serial {device['serial']}")
+        firmware, recommended = device["firmware"], device["recommended_firmware"]
+        if recommended and firmware != recommended:
+            yield Finding(
+                "warning", "firmware", f"{firmware}, {recommended} is recommended: update it with realsense-viewer"
+            )
+        else:
+            yield Finding("ok", "firmware", firmware or "not told")
+        slow = device["usb"].startswith(("1", "2"))
+        advice = ": few profiles and low rates; use a USB 3 port and its cable" if slow else ""
+        yield Finding("warning" if slow else "ok", "usb", f"USB {device['usb'] or 'version not told'}{advice}")
+    serials = [device["serial"] for device in found.devices]
+    if source.serial is not None and source.serial not in serials:
+        there = ", ".join(serials) or "none"
+        yield Finding(
+            "FAIL", "camera", f"source.serial is {source.serial}, and there is {there}: correct it, or plug it in"
+        )
+    elif not serials:
+        yield Finding("FAIL", "camera", _no_camera(await asyncio.to_thread(usb_cameras)))
+    elif len(serials) > 1 and source.serial is None:
+        yield Finding("FAIL", "camera", f"there are {len(serials)}: choose one by source.serial")
+
+
+def _no_camera(on_usb: list[str]) -> str:
+    if on_usb:
+        return (
+            f"the kernel sees {', '.join(on_usb)}, the SDK may not open it: install the udev rules "
+            "(in deploy/systemd), plug it in anew, or run as a member of the group plugdev"
+        )
+    return (
+        "none is connected: check cable and power. To go on without one, play a recording (source.recording) "
+        "or simulate (source.kind: simulated)"
+    )
+
+
+async def _survey() -> link.Found:
+    """What the SDK sees.
+
+    Raises:
+        SourceError: it cannot be loaded, or does not answer.
+    """
+    session = await CaptureSession.begin(link.Survey())
+    deadline_ns = monotonic_ns() + round(SURVEY_S * NS_PER_S)
+    try:
+        while monotonic_ns() < deadline_ns:
+            await session.wait(1.0)
+            while (message := session.message()) is not None:
+                if isinstance(message, link.Found):
+                    return message
+                if isinstance(message, link.Failed):
+                    raise SourceError(message.reason)
+            if session.gone:
+                raise SourceError(f"the RealSense SDK was ended by {await session.ended()}")
+    finally:
+        await session.kill()
+    raise SourceError(f"the RealSense SDK did not answer within {SURVEY_S:g} s; unplug all cameras and try again")
+
+
+def _source(config: UnitConfig) -> tuple[DepthSource, Path | None]:
+    """The source, and where compiled kernels are kept: that is settled before the first of them is imported."""
+    settled = settle(config.jit_cache_dir)
+    from edge_unit.unit import make_source
+
+    return make_source(config.source), settled
+
+
+async def _watch(camera: DepthSource, measured: Measured) -> None:
+    async for frame in camera.frames():
+        _note(measured, frame)
+
+
+def _note(measured: Measured, frame: DepthFrame) -> None:
+    measured.numbers.append(frame.frame_number)
+    measured.captured_ns.append(frame.captured_at_ns)
+    measured.ages_ms.append((monotonic_ns() - frame.captured_at_ns) / NS_PER_MS)
+    if len(measured.depth) < KEPT_FRAMES:
+        measured.depth.append(frame.depth.copy())
+
+
+def _wanted_fps(camera: DepthSource, config: UnitConfig) -> float | None:
+    """The rate that is asked for; None where frames come as fast as they are taken."""
+    if isinstance(camera, RealsenseSource):
+        recorded = isinstance(config.source, RealsenseSourceConfig) and config.source.recording is not None
+        return None if recorded or camera.opened is None else float(camera.opened.fps)
+    return getattr(config.source, "fps", None)
+
+
+def _pipeline(
+    config: UnitConfig,
+    info: CameraInfo,
+    cell: Cell | None,
+    measured: Measured,
+    wanted_fps: float | None,
+    settled: Path | None,
+) -> Iterator[Finding]:
+    """Kernels and what a frame costs, with the frames that were measured and a robot that stands elsewhere in each."""
+    from edge_unit.kernels.foreground import foreground_mask
+    from edge_unit.pipeline import DepthPipeline
+
+    if not measured.depth:
+        return iter(())
+    what = f"cell {cell.name}" if cell is not None else "an empty cell of 2 m, for want of the master's"
+    cell = cell or Cell("stand-in", np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 2.0]))
+    began_ns = monotonic_ns()
+    pipeline = DepthPipeline(info.intrinsics, _pose(config, info, cell), cell, FilterSettings())
+    costs_ms = []
+    count = cell.robot.joint_count if cell.robot is not None else 0
+    for number, depth in enumerate([measured.depth[0], *measured.depth]):
+        joints = np.full(count, 0.02 * number) if count else None
+        started_ns = monotonic_ns()
+        pipeline.process(depth, joints)
+        pipeline.health()
+        pipeline.seen()
+        costs_ms.append((monotonic_ns() - started_ns) / NS_PER_MS)
+        if number == 0:
+            compiled_s = (monotonic_ns() - began_ns) / NS_PER_S
+    findings = [_kernels(settled, compiled_s, compiled=bool(cast(Any, foreground_mask).stats.cache_misses))]
+    cost_ms, worst_ms = float(np.median(costs_ms[1:])), max(costs_ms[1:])
+    text = f"{cost_ms:.1f} ms a frame (worst {worst_ms:.1f}) in {what}"
+    budget_ms = 1000.0 / wanted_fps if wanted_fps else 1000.0 / max(measured.fps, 1.0)
+    if cost_ms <= BUDGET_OK * budget_ms:
+        findings.append(Finding("ok", "pipeline", f"{text}, of {budget_ms:.0f} ms between frames"))
+    else:
+        advice = "frames will be passed over; use a smaller picture, a lower fps or larger voxels"
+        findings.append(Finding("warning", "pipeline", f"{text}, with {budget_ms:.0f} ms between frames: {advice}"))
+    return iter(findings)
+
+
+def _kernels(settled: Path | None, ready_s: float, *, compiled: bool) -> Finding:
+    where = "beside the program or in the user's cache" if settled is None else f"in {settled}"
+    if settled is not None and settled.is_relative_to(tempfile.gettempdir()):
+        return Finding(
+            "warning", "kernels", f"compiled kernels are kept {where}, and lost at each boot; set CELLWATCH_JIT_CACHE"
+        )
+    how = "compiled just now, which the next start will not need" if compiled else "as compiled before"
+    return Finding("ok", "kernels", f"ready in {ready_s:.1f} s, {how}; kept {where}")
+
+
+def _pose(config: UnitConfig, info: CameraInfo, cell: Cell) -> Transform:
+    """Where the camera stands, or, where nobody knows, above the cell looking down."""
+    if config.T_world_camera is not None:
+        return config.T_world_camera.transform()
+    if info.T_world_camera is not None:
+        return info.T_world_camera
+    middle = (cell.box_min_m + cell.box_max_m) / 2.0
+    return look_at([middle[0], middle[1], cell.box_max_m[2] + 0.5], middle)

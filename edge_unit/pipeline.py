@@ -136,9 +136,7 @@ class DepthPipeline:
         nearest_m = self._static_depth_m.copy()
         if self.cell.robot is not None and joints is not None:
             self._check_uncertainty(joint_uncertainty_rad)
-            w = self._bare_robot.nearest_w(self._T_camera_link(joints))
-            np.divide(1.0, w, out=self._divided, where=w > 0.0)
-            np.minimum(nearest_m, self._divided, out=nearest_m, where=w > 0.0)
+            self._bare_robot.lower(self._T_camera_link(joints), nearest_m)
         return nearest_m
 
     def seen(self) -> SeenBlocks:
@@ -246,7 +244,6 @@ class DepthPipeline:
         self._cad = StaticLayer(self.intrinsics, [placed.mesh for placed in (*cell.static, *cell.objects)])
         self._robot = RobotLayer(self.intrinsics, cell.robot, self.settings.robot_padding_m)
         self._bare_robot = BareRobot(self.intrinsics, cell.robot)
-        self._divided = np.empty(self.intrinsics.shape, np.float32)
         links = cell.robot.links if cell.robot else ()
         self._fixed_links = np.array([not link.moving for link in links], np.bool_)
         self._forget_frame()
@@ -286,7 +283,7 @@ class DepthPipeline:
             self._room_raw,
             self._robot.near_raw,
             self._robot.span_raw,
-            self._robot.rows,
+            self._robot.columns,
             self._minimum_raw,
             self._mask,
         )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_unit.expected_depth import NEAR_PLANE_M
+from edge_unit.drawing import NEAR_PLANE_M
 from edge_unit.kernels import seen as kernels
 from shared.camera import Intrinsics
 from shared.lattice import Lattice

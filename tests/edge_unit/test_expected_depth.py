@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from edge_unit.expected_depth import STILL_M, BareRobot, MeshBatch, RobotLayer, StaticLayer
+from edge_unit.drawing import KEPT_AFTER, STILL_M, DepthBuffer, MeshBatch
+from edge_unit.expected_depth import BareRobot, RobotLayer, StaticLayer
 from edge_unit.hull import hull_around
 from edge_unit.kernels.limits import RAW_MAX
 from edge_unit.pipeline import DepthPipeline
@@ -93,10 +94,11 @@ def test_a_link_that_the_near_plane_cuts_does_not_vanish() -> None:
 
 def test_a_batch_without_meshes_draws_nothing() -> None:
     batch, intrinsics = MeshBatch([], inflate=True), camera(64, 40)
-    nearest_w, farthest_w = np.zeros(intrinsics.shape, np.float32), np.full(intrinsics.shape, 9, np.float32)
-    batch.draw(intrinsics, np.zeros((0, 4, 4)), np.zeros(0, np.float32), nearest_w, farthest_w)
-    assert not nearest_w.any()
-    assert (farthest_w == 9).all()
+    buffer = DepthBuffer(intrinsics)
+    buffer.farthest_w[:] = 9
+    batch.draw(intrinsics, np.zeros((0, 4, 4)), np.zeros(0, np.float32), buffer)
+    assert not buffer.nearest_w.any()
+    assert (buffer.farthest_w == 9).all()
 
 
 def test_meshes_of_a_batch_keep_to_themselves() -> None:
@@ -129,11 +131,16 @@ def test_the_bare_robot_forgets_where_it_was() -> None:
     layer = BareRobot(intrinsics, robot)
 
     def draw(angle_rad: float) -> NDArray[np.float32]:
-        return layer.nearest_w(inverse(OVERHEAD) @ robot.link_poses([angle_rad])).copy()
+        depth_m = np.full(intrinsics.shape, np.inf, np.float32)
+        layer.lower(inverse(OVERHEAD) @ robot.link_poses([angle_rad]), depth_m)
+        return depth_m
 
-    first = draw(0.0)
-    assert (draw(1.5) != first).any()
-    assert (draw(0.0) == first).all()
+    first, second = draw(0.0), draw(1.5)
+    assert (second != first).any()
+    # From the fourth drawing on the column is kept; both of its drawings are the same.
+    for _ in range(3 * KEPT_AFTER):
+        assert (draw(0.0) == first).all()
+        assert (draw(1.5) == second).all()
 
 
 # ---------------------------------------------------------------- the padded robot
@@ -191,13 +198,13 @@ def test_the_padding_surrounds_the_robot() -> None:
     assert not (arm.there & ~grown(hit, 20)).any()
 
 
-def test_rows_enclose_the_robot() -> None:
+def test_columns_enclose_the_robot() -> None:
     arm = Arm()
     arm.draw(0.4)
-    first_row, last_row, first_column, last_column = arm.layer.rows
-    rows, columns = np.nonzero(arm.there)
-    assert first_row <= rows.min() <= rows.max() <= last_row
-    assert first_column <= columns.min() <= columns.max() <= last_column
+    u = np.arange(arm.there.shape[1])
+    within = (u >= arm.layer.columns[:, :1]) & (u < arm.layer.columns[:, 1:])
+    assert not (arm.there & ~within).any()
+    assert within.sum() < 4 * arm.there.sum()
 
 
 def test_the_same_joints_are_not_drawn_again() -> None:
@@ -223,7 +230,23 @@ def test_after_any_way_the_band_is_that_of_a_fresh_layer() -> None:
     fresh.draw(0.4)
     assert (arm.layer.near_raw == fresh.layer.near_raw).all()
     assert (arm.layer.span_raw == fresh.layer.span_raw).all()
-    assert (arm.layer.rows == fresh.layer.rows).all()
+    assert (arm.layer.columns == fresh.layer.columns).all()
+
+
+def test_links_that_stand_still_are_kept_and_all_is_as_if_drawn_anew() -> None:
+    """An arm that turns, rests, trembles and goes on, one link of which is lost and found again."""
+    arm = Arm()
+    rng = np.random.default_rng(1)
+    angle = 0.0
+    for n in range(60):
+        angle += rng.choice([0.0, 0.3]) if n % 20 < 12 else 0.0
+        hidden = [n % 15 == 14, 30 <= n < 36]
+        padding_m = PADDING_M + 0.01 * (n % 7 == 6)
+        arm.draw(angle, [PADDING_M, padding_m], hidden)
+        fresh = Arm(arm.robot)
+        fresh.draw(angle, [PADDING_M, padding_m], hidden)
+        assert (arm.layer.near_raw == fresh.layer.near_raw).all(), n
+        assert (arm.layer.span_raw == fresh.layer.span_raw).all(), n
 
 
 def test_trembling_joints_are_not_drawn_again() -> None:

@@ -6,7 +6,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from edge_unit.kernels.limits import RAW_MAX, clear_band, nearest_over, robot_band_raw, static_limit_raw
+from edge_unit.kernels.limits import (
+    RAW_MAX,
+    clear_band,
+    lower_depth,
+    nearest_over,
+    robot_band_raw,
+    span_of_row,
+    static_limit_raw,
+)
 from edge_unit.kernels.rasterize import NOTHING_FARTHEST, NOTHING_NEAREST
 
 SHAPE = (37, 61)
@@ -119,57 +127,112 @@ def band_twin(
     return np.where(drawn, low, RAW_MAX), np.where(drawn, high, RAW_MAX)
 
 
-@pytest.mark.parametrize("scale_m", [0.001, 0.0001, 0.01])
-@pytest.mark.parametrize("seed", range(4))
-def test_robot_band_is_that_of_the_twin(seed: int, scale_m: float) -> None:
-    rng = np.random.default_rng(seed)
-    near_m = rng.uniform(0.05, 8.0, SHAPE)
-    drawn = rng.random(SHAPE) < 0.6
-    nearest_w = np.where(drawn, 1.0 / near_m, 0.0).astype(np.float32)
-    far_m = near_m * rng.choice([1.0, 1.3], SHAPE)
-    farthest_w = np.where(drawn, 1.0 / far_m, NOTHING_FARTHEST).astype(np.float32)
-    # Two that overlap, one at the picture's edge, an empty one.
-    rectangles = np.array([[2, 20, 5, 40], [10, 30, 30, 60], [36, 36, 0, 60], [37, -1, 61, -1]], np.int32)
+RECTANGLES = np.array([[2, 20, 5, 40], [10, 30, 30, 60], [36, 36, 0, 60], [37, -1, 61, -1]], np.int32)
+"""Two that overlap, one at the picture's edge, an empty one."""
+
+
+def between(rectangles: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """In each row all between the leftmost and the rightmost rectangle."""
     inside = np.zeros(SHAPE, np.bool_)
     for top, bottom, left, right in rectangles:
         inside[top : bottom + 1, left : right + 1] = True
-    near_raw, span_raw = np.full(SHAPE, 7, np.uint16), np.full(SHAPE, 9, np.uint16)
-    clear_band(rectangles, near_raw, span_raw)
-    drawing = nearest_w.copy(), farthest_w.copy()
-    robot_band_raw(*drawing, rectangles, 0.02, 0.15, scale_m, near_raw, span_raw)
-    low, high = band_twin(nearest_w, farthest_w, 0.02, 0.15, scale_m)
-    assert (near_raw[~inside] == 7).all()
-    assert (span_raw[~inside] == 9).all()
-    near, end = near_raw.astype(np.float64), near_raw.astype(np.float64) + span_raw
-    slack = 1.0 + 1e-6 * RAW_MAX
-    assert np.abs(near - low)[inside].max() <= slack
-    assert np.abs(end - high)[inside].max() <= 1.0 + slack
-    assert end.max() <= RAW_MAX
-    assert (drawing[0][inside] == NOTHING_NEAREST).all(), "the drawing is cleared in the same pass"
-    assert (drawing[1][inside] == NOTHING_FARTHEST).all()
-    empty = inside & ~drawn
-    assert (near_raw[empty] == RAW_MAX).all()
-    assert (span_raw[empty] == 0).all()
-    clear_band(rectangles, near_raw, span_raw)
-    assert (near_raw[inside] == RAW_MAX).all()
-    assert (span_raw[inside] == 0).all()
-    assert (near_raw[~inside] == 7).all()
+    return np.asarray(np.logical_or.accumulate(inside, 1) & np.logical_or.accumulate(inside[:, ::-1], 1)[:, ::-1])
 
 
-def test_robot_band_without_links() -> None:
-    near_raw, span_raw = np.full((3, 5), 7, np.uint16), np.full((3, 5), 9, np.uint16)
-    w = np.zeros((3, 5), np.float32)
-    nothing = np.zeros((0, 4), np.int32)
-    robot_band_raw(w, w, nothing, 0.02, 0.15, 0.001, near_raw, span_raw)
-    clear_band(nothing, near_raw, span_raw)
-    assert (near_raw == 7).all()
-    assert (span_raw == 9).all()
+def test_the_span_of_a_row_holds_all_rectangles() -> None:
+    for y, row in enumerate(between(RECTANGLES)):
+        first, end = span_of_row(y, RECTANGLES)
+        assert np.nonzero(row)[0].tolist() == list(range(first, end))
+
+
+class Band:
+    """The images of `robot_band_raw`, and drawings for it: buffers are wider than the picture."""
+
+    def __init__(self) -> None:
+        self.near_raw, self.span_raw = np.full(SHAPE, RAW_MAX, np.uint16), np.zeros(SHAPE, np.uint16)
+        self.columns = np.zeros((SHAPE[0], 2), np.int32)
+        wide = (SHAPE[0], SHAPE[1] + 5)
+        self.kept = np.full(wide, NOTHING_NEAREST), np.full(wide, NOTHING_FARTHEST)
+
+    def draw(self, rng: np.random.Generator, rectangles: NDArray[np.int32], scale_m: float) -> None:
+        """Draw what is random, and compare all images with the twin's."""
+        near_m = rng.uniform(0.05, 8.0, self.kept[0].shape)
+        drawn = rng.random(near_m.shape) < 0.6
+        drawn[:, : SHAPE[1]] &= between(rectangles)
+        nearest_w = np.where(drawn, 1.0 / near_m, 0.0).astype(np.float32)
+        far_m = near_m * rng.choice([1.0, 1.3], near_m.shape)
+        farthest_w = np.where(drawn, 1.0 / far_m, NOTHING_FARTHEST).astype(np.float32)
+        drawing = nearest_w.copy(), farthest_w.copy()
+        robot_band_raw(
+            *drawing, *self.kept, rectangles, 0.02, 0.15, scale_m, self.near_raw, self.span_raw, self.columns
+        )  # fmt: skip
+        inner = np.s_[:, : SHAPE[1]]
+        low, high = band_twin(nearest_w[inner], farthest_w[inner], 0.02, 0.15, scale_m)
+        near, end = self.near_raw.astype(np.float64), self.near_raw.astype(np.float64) + self.span_raw
+        slack = 1.0 + 1e-6 * RAW_MAX
+        assert np.abs(near - low).max() <= slack
+        assert np.abs(end - high).max() <= 1.0 + slack
+        assert end.max() <= RAW_MAX
+        empty = ~drawn[inner]
+        assert (self.near_raw[empty] == RAW_MAX).all()
+        assert (self.span_raw[empty] == 0).all()
+        u = np.arange(SHAPE[1])
+        assert (((u >= self.columns[:, :1]) & (u < self.columns[:, 1:])) == between(rectangles)).all()
+        inside = between(rectangles)
+        for got, kept in zip(drawing, self.kept, strict=True):
+            assert (got[inner][inside] == kept[inner][inside]).all(), (
+                "the drawing is taken in, and what is kept put back"
+            )
+
+
+@pytest.mark.parametrize("scale_m", [0.001, 0.0001, 0.01])
+@pytest.mark.parametrize("seed", range(4))
+def test_robot_band_is_that_of_the_twin(seed: int, scale_m: float) -> None:
+    """Again and again on the same images: of the robot that was there before nothing is left."""
+    rng = np.random.default_rng(seed)
+    band = Band()
+    for kept in band.kept:
+        kept[:] = rng.random(kept.shape)
+    for _ in range(6):
+        edges = np.sort(rng.integers(0, SHAPE[0], (3, 2))), np.sort(rng.integers(0, SHAPE[1], (3, 2)))
+        band.draw(rng, np.concatenate(edges, axis=1).astype(np.int32), scale_m)
+    band.draw(rng, RECTANGLES, scale_m)
+    band.draw(rng, RECTANGLES[3:], scale_m)
+    assert (band.near_raw == RAW_MAX).all()
+
+
+def test_a_band_is_cleared_wherever_it_is() -> None:
+    band = Band()
+    band.draw(np.random.default_rng(0), RECTANGLES, 0.001)
+    assert (band.near_raw < RAW_MAX).any()
+    clear_band(band.near_raw, band.span_raw, band.columns)
+    assert (band.near_raw == RAW_MAX).all()
+    assert not band.span_raw.any()
+    assert not band.columns.any()
+    band.draw(np.random.default_rng(0), RECTANGLES[:0], 0.001)
+
+
+def test_lower_depth_takes_the_nearer_and_puts_back_what_is_kept() -> None:
+    rng = np.random.default_rng(0)
+    wide = (SHAPE[0], SHAPE[1] + 5)
+    z_m = np.where(rng.random(wide) < 0.5, rng.uniform(0.5, 3.0, wide), np.inf)
+    before_m = np.where(rng.random(SHAPE) < 0.5, rng.uniform(0.5, 3.0, SHAPE), np.inf).astype(np.float32)
+    nearest_w, farthest_w = (1.0 / z_m).astype(np.float32), np.ones(wide, np.float32)
+    kept = rng.random((2, *wide)).astype(np.float32)
+    depth_m = before_m.copy()
+    lower_depth(nearest_w, farthest_w, *kept, RECTANGLES, depth_m)
+    inside = between(RECTANGLES)
+    assert np.allclose(depth_m[inside], np.minimum(before_m, z_m[:, : SHAPE[1]])[inside])
+    assert (depth_m[~inside] == before_m[~inside]).all()
+    assert (nearest_w[:, : SHAPE[1]][inside] == kept[0][:, : SHAPE[1]][inside]).all()
+    assert (farthest_w[:, : SHAPE[1]][inside] == kept[1][:, : SHAPE[1]][inside]).all()
 
 
 def test_robot_band_of_a_surface_at_the_camera_starts_at_0() -> None:
     """What lies nearer than a band that begins at 0 would wrap around; nothing does."""
-    w = np.full((1, 1), 1 / 0.05, np.float32)
+    w, kept = np.full((1, 1), 1 / 0.05, np.float32), np.zeros((1, 1), np.float32)
     near_raw, span_raw = np.zeros((1, 1), np.uint16), np.zeros((1, 1), np.uint16)
-    robot_band_raw(w, w, np.array([[0, 0, 0, 0]], np.int32), 50.0, 0.15, 0.001, near_raw, span_raw)
+    rectangles, columns = np.array([[0, 0, 0, 0]], np.int32), np.zeros((1, 2), np.int32)
+    robot_band_raw(w, w.copy(), kept, kept, rectangles, 50.0, 0.15, 0.001, near_raw, span_raw, columns)
     assert near_raw[0, 0] == 0
     assert span_raw[0, 0] == pytest.approx(50 + 125 + 150, abs=1)

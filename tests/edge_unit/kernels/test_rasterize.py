@@ -7,13 +7,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from edge_unit.kernels.rasterize import NOTHING_FARTHEST, NOTHING_NEAREST, clear_rectangles, draw_meshes
+from edge_unit.kernels.rasterize import (
+    LANES,
+    NOTHING_FARTHEST,
+    NOTHING_NEAREST,
+    SMALL_ROWS,
+    clear_rectangles,
+    copy_rectangles,
+    draw_meshes,
+)
 from shared.meshes import TriangleMesh, box_mesh, sphere_mesh
 from shared.transforms import Transform, apply, from_xyz_rpy, look_at
 
 NEAR_M = 0.05
 DOUBT_PX = 2e-3
-"""The kernel works in float32: this close to an edge it may decide either way."""
+"""The kernel rounds corners to a thousandth of a pixel: this close to an edge it may decide either way."""
 
 
 @dataclass
@@ -23,14 +31,20 @@ class Screen:
     width: int = 61
     height: int = 43
     f_px: float = 40.0
-    nearest_w: NDArray[np.float32] = None  # type: ignore[assignment]
-    farthest_w: NDArray[np.float32] = None  # type: ignore[assignment]
-    rectangles: NDArray[np.int32] = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        self.nearest_w = np.full((self.height, self.width), NOTHING_NEAREST, np.float32)
-        self.farthest_w = np.full((self.height, self.width), NOTHING_FARTHEST, np.float32)
+        shape = (self.height, self.width + LANES)
+        self.memory = np.full(shape, NOTHING_NEAREST, np.float32), np.full(shape, NOTHING_FARTHEST, np.float32)
+        self.rectangles = np.zeros((0, 4), np.int32)
         self.cx, self.cy = (self.width - 1) / 2.0, (self.height - 1) / 2.0
+
+    @property
+    def nearest_w(self) -> NDArray[np.float32]:
+        return self.memory[0][:, : self.width]
+
+    @property
+    def farthest_w(self) -> NDArray[np.float32]:
+        return self.memory[1][:, : self.width]
 
     @property
     def drawn(self) -> NDArray[np.bool_]:
@@ -42,30 +56,36 @@ class Screen:
         T_camera_mesh: list[Transform],
         padding_m: float = 0.0,
         offsets: list[NDArray[np.float32]] | None = None,
+        chosen: list[bool] | None = None,
     ) -> Screen:
         vertices = [mesh.vertices for mesh in meshes]
         offsets = offsets or [np.zeros_like(points) for points in vertices]
         nothing = np.zeros((0, 3), np.float32)
         self.rectangles = np.full((len(meshes), 4), 77, np.int32)
+        faces = [*(mesh.faces for mesh in meshes), np.zeros((0, 3), np.int32)]
+        most_vertices, most_faces = max([1, *map(len, vertices)]), max(map(len, faces))
         draw_meshes(
-            np.concatenate([*vertices, nothing]),
-            np.concatenate([*offsets, nothing]),
-            np.concatenate([*(mesh.faces for mesh in meshes), np.zeros((0, 3), np.int32)]),
+            np.concatenate([*vertices, nothing]).T.copy(),
+            np.concatenate([*offsets, nothing]).T.copy(),
+            np.concatenate(faces).T.copy(),
             np.cumsum([0, *(len(points) for points in vertices)]).astype(np.int32),
             np.cumsum([0, *(len(mesh.faces) for mesh in meshes)]).astype(np.int32),
             np.array([mesh.closed for mesh in meshes], np.bool_),
+            np.ones(len(meshes), np.bool_) if chosen is None else np.array(chosen),
             np.array(T_camera_mesh, np.float32).reshape(-1, 4, 4)[:, :3].copy(),
             np.full(len(meshes), padding_m, np.float32),
-            self.f_px,
-            self.f_px,
-            self.cx,
-            self.cy,
-            NEAR_M,
-            np.empty((max([1, *(len(points) for points in vertices)]), 6), np.float32),
+            np.float32(self.f_px),
+            np.float32(self.f_px),
+            np.float32(self.cx),
+            np.float32(self.cy),
+            np.float32(NEAR_M),
+            self.width,
+            np.empty((6, most_vertices), np.float32),
+            np.empty(most_faces, np.uint8),
+            np.empty((2, most_faces + 1), np.int32),
             np.empty((3, 3), np.float32),
             np.empty((4, 3), np.float64),
-            self.nearest_w,
-            self.farthest_w,
+            *self.memory,
             self.rectangles,
         )
         return self
@@ -223,9 +243,43 @@ def test_rectangles_hold_what_was_drawn_and_clear_it(seed: int) -> None:
         assert columns.max() <= right < screen.width
         assert (bottom - top) <= np.ptp(rows) + 2
         assert (right - left) <= np.ptp(columns) + 2
-        clear_rectangles(screen.nearest_w, screen.farthest_w, screen.rectangles)
+        clear_rectangles(screen.rectangles, np.ones(1, np.bool_), *screen.memory)
         assert (screen.nearest_w == NOTHING_NEAREST).all()
         assert (screen.farthest_w == NOTHING_FARTHEST).all()
+
+
+def test_only_the_chosen_are_drawn_copied_and_cleared() -> None:
+    ball = sphere_mesh("ball", 0.2)
+    poses = [from_xyz_rpy((x, 0.0, 1.0), (0, 0, 0)) for x in (-0.4, 0.0, 0.4)]
+    both, first = Screen(), Screen()
+    both.draw([ball] * 3, poses, chosen=[True, False, True])
+    assert (both.rectangles[1] == 77).all()
+    first.draw([ball], poses[:1])
+    copied = Screen()
+    copy_rectangles(both.rectangles, np.array([True, False, False]), *both.memory, *copied.memory)
+    assert (copied.nearest_w == first.nearest_w).all()
+    assert (copied.farthest_w == first.farthest_w).all()
+    clear_rectangles(both.rectangles, np.array([False, False, True]), *both.memory)
+    assert (both.nearest_w == first.nearest_w).all()
+    assert (both.farthest_w == first.farthest_w).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_small_and_large_triangles_draw_the_same_picture(seed: int) -> None:
+    """A wall of triangles at the border between the two ways, of all shapes and partly beyond the picture's edges."""
+    rng = np.random.default_rng(seed)
+    screen = Screen(301, 203, 210.0)
+    twin = Twin(screen)
+    size = np.array((LANES, SMALL_ROWS)) * rng.uniform(0.7, 1.3, (150, 1, 2))
+    pixels = rng.uniform((-20, -20), (321, 223), (150, 1, 2)) + size * rng.choice([0.0, 0.5, 1.0], (150, 3, 2))
+    pixels[::2] += rng.uniform(-0.5, 0.5, pixels[::2].shape)
+    z = rng.uniform(0.5, 2.0, (150, 3, 1))
+    points = np.concatenate(((pixels - (screen.cx, screen.cy)) / 210.0 * z, z), axis=-1).reshape(-1, 3)
+    mesh = TriangleMesh("wall", points, np.arange(450).reshape(-1, 3), closed=False)
+    screen.draw([mesh], [np.eye(4)])
+    assert screen.drawn.mean() > 0.05
+    twin.draw(mesh, np.eye(4))
+    twin.check()
 
 
 def test_nearest_and_farthest_of_two_surfaces() -> None:
@@ -304,7 +358,8 @@ def test_a_floor_that_runs_beneath_the_camera_is_cut_not_lost(cells: int) -> Non
     z = 0.3 * 100.0 / np.maximum(y - screen.cy, 1e-9)
     below = (z > NEAR_M) & (z < 8.9)
     assert screen.drawn[below].all()
-    assert np.allclose(1.0 / screen.nearest_w[below], z[below, None], rtol=1e-5)
+    # In w, which is linear on the screen: what a shift by DOUBT_PX makes.
+    assert np.abs(screen.nearest_w[below] - 1.0 / z[below, None]).max() < DOUBT_PX / (0.3 * 100.0)
     assert not screen.drawn[y < screen.cy].any()
 
 

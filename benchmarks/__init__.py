@@ -12,4 +12,5 @@ In the order of the flow:
     sweeps     all of these, as one table
     real_frames the real recordings, and what must come out of them
     real         a real master and a real unit on them, judged frame by frame
+    source_faults what a RealSense source does when the camera makes trouble
 """

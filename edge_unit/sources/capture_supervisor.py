@@ -28,6 +28,8 @@ TICK_S = 0.1
 LATE_NS = NS_PER_S
 """When this program itself stood still for so long, nobody is called stuck for it."""
 
+LOOKING = "it takes pictures of the calibration board, and no depth meanwhile"
+
 FRUITLESS_MAX = 2
 """A recording that twice in a row brought no frame will not bring any."""
 
@@ -249,7 +251,7 @@ class CaptureSupervisor:
         if newest > self._newest:
             self._newest = newest
             self._watchdog.frame(now_ns)
-            self._board.post(self._flowing, warning=opened.warning)
+            self._board.post(self._flowing, LOOKING if self._flowing == "looking" else "", opened.warning)
             self.news.set()
         elif self._request.lockstep:
             # It waits for the reader, or our word that it may go on was lost.

@@ -96,8 +96,10 @@ class Devices:
         try:
             return self._context.load_device(path)
         except RuntimeError as error:
-            text = f"{path}: no recording that can be played; it may have been cut short ({error})"
-            raise RecordingBroken(text) from error
+            why = str(error).rsplit(": ", 1)[-1]
+            raise RecordingBroken(
+                f"{path}: no recording that can be played; it may have been cut short ({why})"
+            ) from error
 
     def _on_change(self, info: rs.event_information) -> None:
         """On a thread of the SDK: only raises flags."""

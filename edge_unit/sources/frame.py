@@ -19,9 +19,9 @@ class DepthFrame:
     """One depth image.
 
     `depth` (H, W) uint16 in units of `depth_scale_m`, 0 where nothing was measured; it may lie in memory that the
-    source uses again, so copy what is to be kept beyond the next frame. `captured_at_ns`
-    is CLOCK_MONOTONIC of this unit at the middle of the exposure. `frame_number` rises; a gap means
-    that frames were dropped. `joints` (n,) rad only where a data set carries them.
+    source uses again, so copy what is to be kept beyond the next frame. `captured_at_ns` is CLOCK_MONOTONIC of this
+    unit at the middle of the exposure. `frame_number` rises; a gap means that frames were dropped. `joints` (n,) rad
+    only where a data set carries them.
     """
 
     depth: NDArray[np.uint16]

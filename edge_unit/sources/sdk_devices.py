@@ -140,10 +140,14 @@ def profiles_of(device: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def _chosen(devices: dict[str, Any], wanted: str) -> tuple[Any, str]:
+    """The wanted device, or the only one; or None, and why."""
     there = ", ".join(serial or "one without a serial number" for serial in sorted(devices)) or "none"
+    if wanted in devices:
+        return devices[wanted], ""
     if wanted:
-        return devices.get(wanted), f"no RealSense camera {wanted} is connected (there is {there})"
+        return None, f"no RealSense camera {wanted} is connected (there is {there})"
     if len(devices) > 1:
         return None, f"{len(devices)} RealSense cameras are connected ({there}); choose one by source.serial"
-    device = next(iter(devices.values()), None)
-    return device, "no RealSense camera is connected; check its cable, and the udev rules (edge-unit doctor)"
+    if not devices:
+        return None, "no RealSense camera is connected; check its cable, and the udev rules (edge-unit doctor)"
+    return next(iter(devices.values())), ""

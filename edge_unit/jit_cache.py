@@ -3,15 +3,21 @@
 
 numba looks for a folder that it can write when a kernel is *defined*, and raises when there is none; so a service
 without a home of its own would not even start. A folder that was filled before but is read-only counts as none.
+
+It compiles a kernel anew when the kernel's own file has changed, and not when that of a kernel or a constant has which
+it uses. So each state of all the kernels has a folder of its own.
 """
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
+import shutil
 import stat
 import sys
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 from shared.errors import JitCacheError
@@ -20,21 +26,33 @@ logger = logging.getLogger(__name__)
 
 VARIABLES = ("CELLWATCH_JIT_CACHE", "NUMBA_CACHE_DIR")
 
+KERNELS = Path(__file__).parent / "kernels"
 
-def settle(directory: Path | str | None = None) -> Path | None:
+STATES_MAX = 3
+"""States of the kernels that are kept: this one, and what one may go back to."""
+
+PREFIX = "kernels-"
+"""Of the folders' names; the rest is a digest of the source."""
+
+
+def settle(directory: Path | str | None = None) -> Path:
     """Choose the folder for compiled kernels; call it before any kernel is imported.
 
-    `directory`, else `$CELLWATCH_JIT_CACHE`, else `$NUMBA_CACHE_DIR`, else numba's own choice, if it can be written;
-    else a private temporary folder, with a warning. Returns the folder, or None where numba chooses.
+    In `directory`, else `$CELLWATCH_JIT_CACHE`, else `$NUMBA_CACHE_DIR`, else where numba would, if it can be written;
+    else in a private temporary folder, with a warning. Returns the folder of the kernels as they are.
 
     Raises:
         JitCacheError: not even a temporary folder can be made.
     """
     wanted = next((Path(name) for name in (directory, *map(os.environ.get, VARIABLES)) if name), None)
+    if wanted is not None and wanted.name.startswith(PREFIX):
+        # Handed down by a process that has settled already.
+        wanted = wanted.parent
     if wanted is not None and _writable(wanted):
         return _use(wanted)
-    if wanted is None and any(_writable(folder) for folder in _numba_choices()):
-        return None
+    for folder in _numba_choices() if wanted is None else ():
+        if _writable(folder):
+            return _use(folder)
     private = _private_folder()
     logger.warning(
         "compiled kernels are kept in %s, since %s cannot be written; set %s to a folder that can",
@@ -45,8 +63,16 @@ def settle(directory: Path | str | None = None) -> Path | None:
     return _use(private)
 
 
-def _use(folder: Path) -> Path:
+def _use(parent: Path) -> Path:
+    folder = parent / f"{PREFIX}{_state_of_kernels()}"
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    with suppress(OSError):
+        # A folder that another process is taking out at the same time is as good as taken out.
+        folder.mkdir(exist_ok=True)
+        os.utime(folder)
+        states = sorted(parent.glob(f"{PREFIX}*"), key=lambda path: path.stat().st_mtime)
+        for old in states[:-STATES_MAX]:
+            shutil.rmtree(old, ignore_errors=True)
     if "numba" in sys.modules:
         # It reads the variable only when it is imported.
         import numba
@@ -55,9 +81,17 @@ def _use(folder: Path) -> Path:
     return folder
 
 
+def _state_of_kernels() -> str:
+    """Changes whenever any kernel does."""
+    digest = hashlib.sha256()
+    for file in sorted(KERNELS.glob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:12]
+
+
 def _numba_choices() -> list[Path]:
     """Where numba looks by itself: beside the source, then in the user's cache."""
-    beside = Path(__file__).parent / "kernels" / "__pycache__"
+    beside = KERNELS / "__pycache__"
     cache_home = os.environ.get("XDG_CACHE_HOME")
     try:
         return [beside, Path(cache_home) / "numba" if cache_home else Path.home() / ".cache" / "numba"]

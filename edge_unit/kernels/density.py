@@ -118,7 +118,7 @@ def demand(
     own_needed: NDArray[np.float64],
     needed: NDArray[np.float64],
 ) -> None:
-    """What a voxel must hold by itself, and with its 26 neighbours; `share` of a full voxel is what is asked at most."""
+    """What a voxel must hold by itself, and with its 26 neighbours; `share` of a full one is asked at most."""
     own_share = threshold if single else own_share_min
     around_share = 0.0 if single else threshold * share
     floor_points, floor_voxels = (0.0, 0.0) if single else (points_min, FLOOR_VOXELS)

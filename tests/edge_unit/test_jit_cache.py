@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import pytest
 
 from edge_unit import jit_cache
@@ -45,21 +46,26 @@ def compile_with(tmp_path: Path, *arguments: str, **variables: str) -> tuple[str
     return done.stdout.strip(), done.stderr.strip()
 
 
-def test_by_default_numba_chooses(tmp_path: Path) -> None:
-    assert compile_with(tmp_path) == ("", "")
+def test_by_default_it_is_where_numba_would_keep_them(tmp_path: Path) -> None:
+    found, logged = compile_with(tmp_path)
+    assert Path(found).parent in jit_cache._numba_choices()
+    assert logged == ""
 
 
 @pytest.mark.parametrize("variable", jit_cache.VARIABLES)
 def test_a_folder_from_the_environment(tmp_path: Path, variable: str) -> None:
     folder = str(tmp_path / "kernels")
-    assert compile_with(tmp_path, **{variable: folder}) == (folder, "")
+    found, logged = compile_with(tmp_path, **{variable: folder})
+    assert Path(found).parent == Path(folder)
+    assert logged == ""
     assert any((tmp_path / "kernels").rglob("*.nbi"))
 
 
 def test_a_folder_from_the_configuration_wins(tmp_path: Path) -> None:
     chosen = str(tmp_path / "chosen")
     found, logged = compile_with(tmp_path, chosen, CELLWATCH_JIT_CACHE=str(tmp_path / "other"))
-    assert (found, logged) == (chosen, "")
+    assert str(Path(found).parent) == chosen
+    assert logged == ""
 
 
 def test_a_folder_that_cannot_be_written_is_a_warning_and_no_crash(tmp_path: Path) -> None:
@@ -67,11 +73,11 @@ def test_a_folder_that_cannot_be_written_is_a_warning_and_no_crash(tmp_path: Pat
     wanted = str(tmp_path / "file" / "kernels")
     for arguments, variables in (((wanted,), {}), ((), {"NUMBA_CACHE_DIR": wanted})):
         found, logged = compile_with(tmp_path, *arguments, **variables)
-        assert Path(found).parent == tmp_path
+        assert Path(found).parent.parent == tmp_path
         assert wanted in logged
         assert "CELLWATCH_JIT_CACHE" in logged
         assert logged.count("\n") == 0
-        assert Path(found).stat().st_mode & 0o777 == 0o700
+        assert Path(found).parent.stat().st_mode & 0o777 == 0o700
 
 
 def test_without_any_folder_of_its_own_a_private_one_is_taken(
@@ -84,7 +90,6 @@ def test_without_any_folder_of_its_own_a_private_one_is_taken(
     monkeypatch.setattr(jit_cache.tempfile, "tempdir", str(tmp_path))
     (tmp_path / "file").write_text("")
     first = jit_cache.settle()
-    assert first is not None
     assert first == jit_cache.settle()
     assert f"{tmp_path}/file/a nor {tmp_path}/file/b cannot be written" in caplog.text
 
@@ -107,3 +112,21 @@ def test_when_nothing_at_all_can_be_written_it_says_so(tmp_path: Path, monkeypat
     monkeypatch.setattr(jit_cache.tempfile, "tempdir", str(tmp_path / "file"))
     with pytest.raises(JitCacheError, match="not even a temporary one"):
         jit_cache._private_folder()
+
+
+def test_each_state_of_the_kernels_has_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """numba would not see that a kernel or a constant in another file has changed."""
+    monkeypatch.setattr(jit_cache.os, "environ", dict(os.environ))
+    monkeypatch.setattr(numba.config, "CACHE_DIR", numba.config.CACHE_DIR)
+    kernels = tmp_path / "kernels"
+    kernels.mkdir()
+    monkeypatch.setattr(jit_cache, "KERNELS", kernels)
+    folders = []
+    for state in range(jit_cache.STATES_MAX + 2):
+        (kernels / "some.py").write_text(f"NUMBER = {state}\n")
+        folders.append(jit_cache.settle(tmp_path / "cache"))
+        os.utime(folders[-1], (state, state))
+        assert jit_cache.settle(folders[-1]) == folders[-1]
+        os.utime(folders[-1], (state, state))
+    assert len(set(folders)) == len(folders)
+    assert sorted((tmp_path / "cache").iterdir()) == sorted(folders[-jit_cache.STATES_MAX :])

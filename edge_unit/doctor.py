@@ -292,7 +292,7 @@ async def _survey() -> link.Found:
     raise SourceError(f"the RealSense SDK did not answer within {SURVEY_S:g} s; unplug all cameras and try again")
 
 
-def _source(config: UnitConfig) -> tuple[DepthSource, Path | None]:
+def _source(config: UnitConfig) -> tuple[DepthSource, Path]:
     """The source, and where compiled kernels are kept: that is settled before the first of them is imported."""
     settled = settle(config.jit_cache_dir)
     from edge_unit.unit import make_source
@@ -327,7 +327,7 @@ def _pipeline(
     cell: Cell | None,
     measured: Measured,
     wanted_fps: float | None,
-    settled: Path | None,
+    settled: Path,
 ) -> Iterator[Finding]:
     """Kernels and what a frame costs, with the frames that were measured and a robot that stands elsewhere in each."""
     from edge_unit.kernels.foreground import foreground_mask
@@ -362,9 +362,9 @@ def _pipeline(
     return iter(findings)
 
 
-def _kernels(settled: Path | None, ready_s: float, *, compiled: bool) -> Finding:
-    where = "beside the program or in the user's cache" if settled is None else f"in {settled}"
-    if settled is not None and settled.is_relative_to(tempfile.gettempdir()):
+def _kernels(settled: Path, ready_s: float, *, compiled: bool) -> Finding:
+    where = f"in {settled}"
+    if settled.is_relative_to(tempfile.gettempdir()):
         return Finding(
             "warning", "kernels", f"compiled kernels are kept {where}, and lost at each boot; set CELLWATCH_JIT_CACHE"
         )

@@ -16,6 +16,7 @@ class EdgeHalo:
     def __init__(self, intrinsics: Intrinsics) -> None:
         self._intrinsics = intrinsics
         self._pixels = np.empty(0, np.int32)
+        self._runs = np.empty((0, 4), np.int32)
         self._near_raw = np.empty(0, np.uint16)
         self._span_raw = np.empty(0, np.uint16)
 
@@ -42,13 +43,23 @@ class EdgeHalo:
             self._near_raw,
             self._span_raw,
         )
+        self._runs = runs_of(self._pixels, camera.width)
 
     def drop(self, depth_raw: NDArray[np.uint16], mask: NDArray[np.uint8]) -> None:
         """Take out of `mask` (H, at least W) what an edge explains."""
-        halo.drop_halo(depth_raw, self._pixels, self._near_raw, self._span_raw, mask)
+        halo.drop_halo(depth_raw, self._runs, self._near_raw, self._span_raw, mask)
 
     def lower(self, limit_raw: NDArray[np.uint16], out: NDArray[np.uint16]) -> None:
         """`limit_raw` (H, W) into `out`, but where a halo may hide something no farther than its near end."""
         np.copyto(out, limit_raw)
         flat = out.reshape(-1)
         flat[self._pixels] = np.minimum(flat[self._pixels], self._near_raw)
+
+
+def runs_of(pixels: NDArray[np.int32], width: int) -> NDArray[np.int32]:
+    """Pixels (N,) `y * width + x`, ascending, as runs (R, 4) of neighbours: row, first column, start and end in N."""
+    is_first = np.ones(len(pixels), np.bool_)
+    is_first[1:] = (np.diff(pixels) != 1) | (pixels[1:] % width == 0)
+    starts = np.flatnonzero(is_first)
+    rows, columns = np.divmod(pixels[starts], width)
+    return np.stack((rows, columns, starts, np.append(starts[1:], len(pixels))[: len(starts)]), axis=1).astype(np.int32)

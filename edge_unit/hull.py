@@ -82,7 +82,9 @@ def _distance(
     samples_m = np.empty((number, 3), np.float32)
     kernels.sample_faces(mesh.vertices, mesh.faces, spacing_m, samples_m)
     # Fine meshes give many more points than are needed; one of each grain will do.
-    _, first = np.unique(np.floor(samples_m / (0.5 * spacing_m)).astype(np.int32), axis=0, return_index=True)
+    grain = np.floor(samples_m / (0.5 * spacing_m)).astype(np.int64)
+    grain -= grain.min(axis=0)
+    _, first = np.unique(np.ravel_multi_index(tuple(grain.T), tuple(grain.max(axis=0) + 1)), return_index=True)
     reach = int(np.ceil((distance_m + grid_m) / grid_m))
     far_m = distance_m + 2.0 * grid_m
     squared_m2 = np.full(tuple(shape), far_m * far_m, np.float32)

@@ -14,6 +14,9 @@ from shared.camera import Intrinsics
 from shared.lattice import Lattice
 from shared.transforms import Transform, inverse
 
+ROWS_LOOKED_AT = 360
+"""Of a larger image only every second row is looked at, or every third: a block of 100 mm is 16 rows at 4 m."""
+
 MAX_BLOCKS = 2**17
 """16 kB of bits before compression; in a cell that needs more, the blocks are larger."""
 
@@ -58,6 +61,8 @@ class Visibility:
         self._blocks = np.empty(self.lattice.cell_count, np.int32)
         self._views = np.empty((self.lattice.cell_count, 5), np.int32)
         self._seen = np.zeros(self.lattice.cell_count, np.uint8)
+        self._rows_apart = max(intrinsics.height // ROWS_LOOKED_AT, 1)
+        self._reach_raw = np.empty((-(-intrinsics.height // self._rows_apart), intrinsics.width), np.uint16)
         self.place(T_world_camera)
 
     def place(self, T_world_camera: Transform) -> None:
@@ -96,6 +101,8 @@ class Visibility:
             self._views,
             self._number,
             share_min,
+            self._rows_apart,
+            self._reach_raw,
             self._seen,
         )
         return SeenBlocks(self._seen.copy(), self.lattice)

@@ -103,16 +103,31 @@ def halo_bands(
 
 
 @kernel
-def drop_halo(
+def drop_run(
     depth_raw: NDArray[np.uint16],
-    pixels: NDArray[np.int32],
     near_raw: NDArray[np.uint16],
     span_raw: NDArray[np.uint16],
     mask: NDArray[np.uint8],
 ) -> None:
-    """Take the pixels of `depth_raw` (H, W) that lie in their halo's band out of `mask` (H, at least W)."""
-    width = depth_raw.shape[1]
-    for i in range(len(pixels)):
-        y = pixels[i] // width
-        x = pixels[i] - y * width
-        mask[y, x] &= np.uint16(depth_raw[y, x] - near_raw[i]) > span_raw[i]
+    """One run of `drop_halo`; written for the vectoriser."""
+    for x in range(len(near_raw)):
+        mask[x] &= np.uint16(depth_raw[x] - near_raw[x]) > span_raw[x]
+
+
+@kernel
+def drop_halo(
+    depth_raw: NDArray[np.uint16],
+    runs: NDArray[np.int32],
+    near_raw: NDArray[np.uint16],
+    span_raw: NDArray[np.uint16],
+    mask: NDArray[np.uint8],
+) -> None:
+    """Take the pixels of `depth_raw` (H, W) that lie in their halo's band out of `mask` (H, at least W).
+
+    The pixels that have one come in `runs` (R, 4) of neighbours in a row: the row, the first column, and the first of
+    the run's bands in `near_raw` and `span_raw` (N,) and the one after its last.
+    """
+    for i in range(len(runs)):
+        y, first, start, end = runs[i]
+        last = first + end - start
+        drop_run(depth_raw[y, first:last], near_raw[start:end], span_raw[start:end], mask[y, first:last])

@@ -76,6 +76,49 @@ def block_views(
 
 
 @kernel
+def reach_of_row(
+    depth_raw: NDArray[np.uint16],
+    static_limit_raw: NDArray[np.uint16],
+    robot_near_raw: NDArray[np.uint16],
+    reach_raw: NDArray[np.uint16],
+) -> None:
+    """How far each ray of a row is sure to pass; written for the vectoriser."""
+    for x in range(len(reach_raw)):
+        reach_raw[x] = min(depth_raw[x], min(static_limit_raw[x], robot_near_raw[x]))
+
+
+@kernel
+def passes(
+    reach_raw: NDArray[np.uint16],
+    first_row: int,
+    last_row: int,
+    first_column: int,
+    last_column: int,
+    far_raw: int,
+    share_min: float,
+) -> bool:
+    """Whether at least `share_min` of the rays that are probed inside a rectangle reach `far_raw`."""
+    row_step = max((last_row - first_row) // RAYS_PER_SIDE, 1)
+    column_step = np.uint64(max((last_column - first_column) // RAYS_PER_SIDE, 1))
+    rows = (last_row - first_row) // row_step + 1
+    columns = (last_column - first_column) // np.int64(column_step) + 1
+    probed = rows * columns
+    needed = share_min * probed
+    far = np.uint16(far_raw)
+    possible = probed
+    for y in range(first_row, last_row + 1, row_step):
+        row = reach_raw[y]
+        x = np.uint64(first_column)
+        for _ in range(columns):
+            possible -= row[x] < far
+            x += column_step
+        # Most blocks are seen wholly or not at all.
+        if possible < needed:
+            return False
+    return True
+
+
+@kernel
 def seen_blocks(
     depth_raw: NDArray[np.uint16],
     static_limit_raw: NDArray[np.uint16],
@@ -84,22 +127,20 @@ def seen_blocks(
     views: NDArray[np.int32],
     number: int,
     share_min: float,
+    rows_apart: int,
+    reach_raw: NDArray[np.uint16],
     seen: NDArray[np.uint8],
 ) -> None:
     """Set `seen` (all blocks,) to 1 for the blocks through which at least `share_min` of the probed rays pass, else 0.
 
-    Images are (H, W); `blocks` and `views` are those of `block_views`, of which `number` count.
+    Images are (H, W); `blocks` and `views` are those of `block_views`, of which `number` count. Only every
+    `rows_apart`-th row is looked at. Scratch: `reach_raw` (H / rows_apart, rounded up, W).
     """
+    for y in range(len(reach_raw)):
+        row = y * rows_apart
+        # An unmeasured pixel has depth 0 and passes nothing.
+        reach_of_row(depth_raw[row], static_limit_raw[row], robot_near_raw[row], reach_raw[y])
     seen[:] = 0
     for i in range(number):
-        first_row, last_row, first_column, last_column, far = views[i]
-        row_step = max((last_row - first_row) // RAYS_PER_SIDE, 1)
-        column_step = max((last_column - first_column) // RAYS_PER_SIDE, 1)
-        probed = 0
-        passed = 0
-        for y in range(first_row, last_row + 1, row_step):
-            for x in range(first_column, last_column + 1, column_step):
-                probed += 1
-                # An unmeasured pixel has depth 0 and passes nothing.
-                passed += min(depth_raw[y, x], static_limit_raw[y, x], robot_near_raw[y, x]) >= far
-        seen[blocks[i]] = passed >= share_min * probed
+        first_row, last_row = views[i, 0] // rows_apart, views[i, 1] // rows_apart
+        seen[blocks[i]] = passes(reach_raw, first_row, last_row, views[i, 2], views[i, 3], views[i, 4], share_min)

@@ -4,6 +4,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_unit.halo import runs_of
 from edge_unit.pipeline import DepthPipeline
 from shared.camera import Intrinsics
 from shared.cell import Cell, PlacedMesh
@@ -74,3 +75,17 @@ def test_the_halo_follows_the_cell_and_the_settings() -> None:
     assert not watched.foreground(grown, None).any()
     watched.apply(FilterSettings(static_padding_m=0.0))
     assert watched.foreground(grown, None).any()
+
+
+def test_runs_are_the_pixels_that_they_came_from() -> None:
+    """At a row's end a run ends, too."""
+    rng = np.random.default_rng(0)
+    for share in (0.0, 0.3, 0.9, 1.0):
+        marked = rng.random((13, 17)) < share
+        pixels = np.flatnonzero(marked).astype(np.int32)
+        runs = runs_of(pixels, 17)
+        found = [17 * y + x + k for y, x, start, end in runs.tolist() for k in range(end - start)]
+        assert found == pixels.tolist()
+        assert all(x + end - start <= 17 for _, x, start, end in runs.tolist())
+        assert [start for _, _, start, _ in runs.tolist()][1:] == [end for *_, end in runs.tolist()][:-1]
+        assert len(runs) == (np.diff(marked, axis=1, prepend=False) & marked).sum()

@@ -75,7 +75,7 @@ def test_no_block_in_view() -> None:
     seen = np.full(LATTICE.cell_count, 7, np.uint8)
     image = np.full(CAMERA.shape, 65535, np.uint16)
     nothing = views(LATTICE, away)
-    seen_blocks(image, image, image, nothing[1], nothing[2], 0, 0.9, seen)
+    seen_blocks(image, image, image, nothing[1], nothing[2], 0, 0.9, 1, np.empty_like(image), seen)
     assert not seen.any()
 
 
@@ -87,20 +87,22 @@ def test_blocks_beyond_the_largest_raw_depth_are_not_in_view() -> None:
 
 
 def look(
-    depth: NDArray[np.uint16], limit: NDArray[np.uint16], robot: NDArray[np.uint16], share: float = 0.9
+    depth: NDArray[np.uint16], limit: NDArray[np.uint16], robot: NDArray[np.uint16], share: float = 0.9, apart: int = 1
 ) -> NDArray[np.uint8]:
     number, blocks, rectangles = views(LATTICE, ABOVE)
     seen = np.full(LATTICE.cell_count, 7, np.uint8)
-    seen_blocks(depth, limit, robot, blocks, rectangles, number, share, seen)
+    reach = np.empty((-(-len(depth) // apart), depth.shape[1]), np.uint16)
+    seen_blocks(depth, limit, robot, blocks, rectangles, number, share, apart, reach, seen)
     return seen
 
 
 def look_twin(
-    depth: NDArray[np.uint16], limit: NDArray[np.uint16], robot: NDArray[np.uint16], share: float = 0.9
+    depth: NDArray[np.uint16], limit: NDArray[np.uint16], robot: NDArray[np.uint16], share: float = 0.9, apart: int = 1
 ) -> NDArray[np.uint8]:
     seen = np.zeros(LATTICE.cell_count, np.uint8)
-    through = np.minimum(np.minimum(depth, limit), robot)
+    through = np.minimum(np.minimum(depth, limit), robot)[::apart]
     for key, (top, bottom, left, right, far) in views_twin(LATTICE, ABOVE).items():
+        top, bottom = top // apart, bottom // apart
         rows = range(top, bottom + 1, max((bottom - top) // RAYS_PER_SIDE, 1))
         columns = range(left, right + 1, max((right - left) // RAYS_PER_SIDE, 1))
         rays = through[np.ix_(rows, columns)]
@@ -109,15 +111,16 @@ def look_twin(
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9, 1.0])
+@pytest.mark.parametrize("apart", [1, 2, 3])
 @pytest.mark.parametrize("seed", range(4))
-def test_seen_is_that_of_the_twin(seed: int, share: float) -> None:
+def test_seen_is_that_of_the_twin(seed: int, apart: int, share: float) -> None:
     rng = np.random.default_rng(seed)
     images = [rng.choice(np.array([0, 1500, 1700, 1900, 65535], np.uint16), CAMERA.shape) for _ in range(3)]
     # Whole regions, else next to nothing would be seen.
     for image in images:
         image[:, rng.integers(0, 60) :] = 65535
-    seen = look(*images, share)
-    assert (seen == look_twin(*images, share)).all()
+    seen = look(*images, share, apart)
+    assert (seen == look_twin(*images, share, apart)).all()
 
 
 def test_what_hides_a_block() -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Literal
 
@@ -21,6 +20,7 @@ from edge_unit.sources.frame import CameraInfo, DepthFrame
 from shared.cell import Cell
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, SourceError
+from shared.waiting import within
 
 if TYPE_CHECKING:
     from simulation.camera import SimulatedCamera, SimulatedFrame
@@ -65,6 +65,8 @@ class SimulatedSource:
     def __init__(self, config: SimulatedSourceConfig) -> None:
         self._config = config
         self._period_ns = round(NS_PER_S / config.fps)
+        # Nobody triggers the cameras of a cell together; here they take turns.
+        self._first_ns = config.epoch_ns + self._period_ns * config.camera // config.cameras
         self._camera: SimulatedCamera | None = None
         self._truth: TruthFinder | None = None
         self._truth_file: BinaryIO | None = None
@@ -92,10 +94,8 @@ class SimulatedSource:
         number = -1
         while not self._closing.is_set():
             number = self._next_number(number, monotonic_ns())
-            due_ns = self._config.epoch_ns + number * self._period_ns
-            with suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._closing.wait(), (due_ns - monotonic_ns()) / NS_PER_S)
-            if self._closing.is_set():
+            due_ns = self._first_ns + number * self._period_ns
+            if await within((due_ns - monotonic_ns()) / NS_PER_S, self._closing.wait()):
                 return
             frame = await loop.run_in_executor(worker, self._capture, due_ns)
             if writing is not None:
@@ -114,7 +114,7 @@ class SimulatedSource:
 
     def _next_number(self, last: int, now_ns: int) -> int:
         """The frame after `last`, or a later one when a slow reader has let more become due."""
-        latest_due = (now_ns - self._config.epoch_ns) // self._period_ns
+        latest_due = (now_ns - self._first_ns) // self._period_ns
         return max(last + 1, latest_due if last >= 0 else latest_due + 1, 0)
 
     def _start(self) -> CameraInfo:

@@ -56,7 +56,7 @@ class MeshBatch:
         faces_max = max((len(mesh.faces) for mesh in meshes), default=1)
         self._placed = np.empty((6, vertices_max), np.float32)
         self._kinds = np.empty(faces_max, np.uint8)
-        self._lists = np.empty((2, faces_max + 1), np.int32)
+        self._lists = np.empty((3, faces_max + 1), np.int32)
         self._corners = np.empty((3, 3), np.float32)
         self._polygon = np.empty((4, 3), np.float64)
 
@@ -120,13 +120,14 @@ class LinkDrawing:
         """First and last row, first and last column (L, 4) that each link may have touched."""
         return self._batch.rectangles
 
-    def is_still(self, T_camera_link: NDArray[np.float64], padding_m: NDArray[np.float32]) -> bool:
-        """Whether no vertex has moved by more than STILL_M since it was drawn."""
-        return not self._moved(T_camera_link, padding_m).any()
+    def draw(self, T_camera_link: NDArray[np.float64], padding_m: NDArray[np.float32], anew: bool = True) -> bool:
+        """Draw the links at poses (L, 4, 4), each grown by its padding (L,) m.
 
-    def draw(self, T_camera_link: NDArray[np.float64], padding_m: NDArray[np.float32]) -> None:
-        """Draw the links at poses (L, 4, 4), each grown by its padding (L,) m."""
+        Unless it must be `anew`, nothing is drawn and False returned when no vertex has moved by more than STILL_M.
+        """
         moved = self._moved(T_camera_link, padding_m)
+        if not anew and not moved.any():
+            return False
         self._still_for[moved] = 0
         self._still_for[~moved] += 1
         still = self._still_for >= KEPT_AFTER
@@ -136,6 +137,7 @@ class LinkDrawing:
         self._batch.draw(self._intrinsics, T_camera_link, padding_m, self.buffer, drawn)
         self._poses[drawn] = T_camera_link[drawn]
         self._padding_m[drawn] = padding_m[drawn]
+        return True
 
     def _keep(
         self, still: NDArray[np.bool_], T_camera_link: NDArray[np.float64], padding_m: NDArray[np.float32]

@@ -86,9 +86,8 @@ class RobotLayer:
             T_camera_link[hidden, 2, 3] = -1.0
         growth_m = padding_m - np.float32(self._hull_m)
         drawing = self._drawing
-        if self._is_shown and drawing.is_still(T_camera_link, growth_m):
+        if not drawing.draw(T_camera_link, growth_m, anew=not self._is_shown):
             return False
-        drawing.draw(T_camera_link, growth_m)
         limits.robot_band_raw(
             drawing.buffer.nearest_w,
             drawing.buffer.farthest_w,

@@ -295,6 +295,9 @@ class DepthPipeline:
         self._depth_raw = self._no_depth_raw
 
     def _draw_cad(self) -> None:
+        """Place what does not move before the camera: CAD, objects, and the robot's base."""
+        T_camera_world = inverse(self.T_world_camera)
+        self._T_camera_base = T_camera_world @ self.cell.robot.T_world_base if self.cell.robot else T_camera_world
         placed = (*self.cell.static, *self.cell.objects)
         self._cad.draw(self.T_world_camera, [each.T_world_mesh for each in placed])
 
@@ -338,10 +341,10 @@ class DepthPipeline:
         """Poses (L, 4, 4) of the robot's links in the camera frame."""
         robot = self.cell.robot
         assert robot is not None
-        return inverse(self.T_world_camera) @ robot.T_world_base @ robot.link_poses(joints)
+        return self._T_camera_base @ robot.link_poses(joints)
 
     def _check_uncertainty(self, joint_uncertainty_rad: ArrayLike) -> NDArray[np.float64]:
-        """The uncertainty (n,) of each joint."""
+        """The uncertainty of all joints () or of each (n,)."""
         robot = self.cell.robot
         count = robot.joint_count if robot else 0
         try:
@@ -354,7 +357,7 @@ class DepthPipeline:
                 f"joint_uncertainty_rad: expected one finite number of at least 0, or {count}, "
                 f"got {uncertainty.tolist()}"
             )
-        return np.broadcast_to(uncertainty, (count,))
+        return uncertainty
 
     @property
     def _noise_per_m(self) -> float:

@@ -4,8 +4,8 @@
 What is linear on the screen is 1/z, not z; so the buffers hold `w = 1/z` (1/m): the nearest surface
 has the largest w, and 0 means that nothing stands there. Pixel centres are at integer coordinates.
 
-Corners are rounded to `1 / SUBPIXELS` of a pixel. Small triangles, which are nearly all, are then drawn with integers
-that never round: by edge functions, `LANES` pixels of a row at once. Large ones go span by span in float64.
+Corners are rounded to `1 / SUBPIXELS` of a pixel. Small triangles, which are nearly all, are then drawn by edge
+functions in integers, which never round, `LANES` pixels of a row at once. Large ones go span by span in float64.
 """
 
 from __future__ import annotations
@@ -28,17 +28,18 @@ LANES = 16
 """Pixels of a row that are drawn at once, whether they are needed or not; buffers are so much wider than the picture.
 With fewer the compiler unrolls the loop before it could vectorise it."""
 
-SMALL_ROWS = 24
-"""Triangles up to `LANES` wide and so many rows high are drawn with 32-bit integers: (16 + 16) * (24 + 24) pixels
-in units of 1/1024 squared stay below 2**31."""
+SUBPIXELS = np.float32(512.0)
+"""Corners are off by a thousandth of a pixel at most; a depth camera cannot tell half a pixel."""
 
-SUBPIXELS = np.float32(1024.0)
-"""A thousandth of a pixel, far below what float32 leaves of a corner in the picture of a large camera."""
+SUBPIXEL = np.float32(1.0 / 512.0)
 
-SUBPIXEL = np.float32(1.0 / 1024.0)
+SMALL_ROWS = 96
+"""Triangles up to twice `LANES` wide and so many rows high are drawn with integers of 32 bits. An edge's function is
+the difference of two products, at most (32 + 16) * 96 + 32 * 96 pixels in units of 1/512 squared: 2.01e9 of 2.15e9."""
 
-UNSEEN, SMALL, LARGE = 0, 1, 2
-"""What is done with a triangle: nothing, for it is turned away or holds no pixel centre; or how it is drawn."""
+UNSEEN, SMALL, WIDE, LARGE = 0, 1, 2, 3
+"""What is done with a triangle: nothing, for it is turned away or holds no pixel centre; or how it is drawn: at once
+when no wider than `LANES`, in two halves when no wider than twice that, or span by span."""
 
 
 @kernel
@@ -107,7 +108,8 @@ def sort_faces(
 
     Written for the vectoriser: no branch. Faces turned away are left out when the mesh is `closed` (Algorithm 3).
     """
-    zero, width, height = np.float32(0.0), np.float32(LANES), np.float32(SMALL_ROWS)
+    zero, width, height = np.float32(0.0), np.float32(LANES - 1), np.float32(SMALL_ROWS - 1)
+    twice = np.float32(2 * LANES - 1)
     for f in range(len(a)):
         i, j, k = np.uint32(a[f]), np.uint32(b[f]), np.uint32(c[f])
         u0, u1, u2 = u_px[i], u_px[j], u_px[k]
@@ -119,8 +121,10 @@ def sort_faces(
         double_area = np.float64(u1 - u0) * np.float64(v2 - v0) - np.float64(u2 - u0) * np.float64(v1 - v0)
         turned_here = (double_area < 0.0) | ((not closed) & (double_area > 0.0))
         seen = holds_column & holds_row & turned_here
-        small = (right - left < width) & (bottom - top < height)
-        kinds[f] = np.uint8(seen) + np.uint8(seen & (not small))
+        low = bottom - top <= height
+        narrow, wide = low & (right - left <= width), low & (right - left <= twice)
+        # UNSEEN and one more for each step; a choice between constants would not be vectorised.
+        kinds[f] = np.uint8(seen) + np.uint8(seen & (not narrow)) + np.uint8(seen & (not wide))
 
 
 @kernel
@@ -143,22 +147,29 @@ def sort_cut_faces(
 
 
 @kernel
-def list_faces(kinds: NDArray[np.uint8], small: NDArray[np.int32], large: NDArray[np.int32]) -> tuple[int, int]:
-    """The numbers of the small and of the large triangles; returns how many there are of each."""
+def list_faces(
+    kinds: NDArray[np.uint8], small: NDArray[np.int32], wide: NDArray[np.int32], large: NDArray[np.int32]
+) -> tuple[int, int, int]:
+    """The numbers of the small and wide, of the wide, and of the large triangles; returns how many of each."""
     # Unsigned, for a signed index is tested for counting from the end.
-    smalls, larges = np.uint64(0), np.uint64(0)
+    smalls, wides, larges = np.uint64(0), np.uint64(0), np.uint64(0)
     for f in range(len(kinds)):
         # Written always and kept when it is one: a branch would be guessed wrong too often.
         small[smalls] = f
+        wide[wides] = f
         large[larges] = f
-        smalls += np.uint64(kinds[f] == SMALL)
-        larges += np.uint64(kinds[f] == LARGE)
-    return np.int64(smalls), np.int64(larges)  # type: ignore[return-value]  # to numba they are plain numbers
+        kind = kinds[f]
+        smalls += np.uint64((kind == SMALL) | (kind == WIDE))
+        wides += np.uint64(kind == WIDE)
+        larges += np.uint64(kind == LARGE)
+    # To numba they are plain numbers.
+    return np.int64(smalls), np.int64(wides), np.int64(larges)  # type: ignore[return-value]
 
 
 @kernel
 def fill_small(
     faces: NDArray[np.int32],
+    from_column: np.float32,
     a: NDArray[np.int32],
     b: NDArray[np.int32],
     c: NDArray[np.int32],
@@ -172,7 +183,7 @@ def fill_small(
     farthest_w: NDArray[np.float32],
     rectangle: NDArray[np.int32],
 ) -> None:
-    """Draw the triangles whose numbers are `faces`, none larger than `LANES` by `SMALL_ROWS` pixels.
+    """Draw `LANES` columns, from each one's column `from_column` on, of the triangles whose numbers are `faces`.
 
     A pixel is drawn when its centre is on the inner side of all three edges, or on one: neighbours leave no gap, for
     integers do not round. `nearest_w` and `farthest_w` are flat, `stride` to a row. `rectangle` (4,) as in
@@ -188,11 +199,12 @@ def fill_small(
         u0, u1, u2 = u_px[i], u_px[j], u_px[k]
         v0, v1, v2 = v_px[i], v_px[j], v_px[k]
         w0, w1, w2 = w_per_m[i], w_per_m[j], w_per_m[k]
-        u_left = np.ceil(max(min(u0, min(u1, u2)), zero))
+        u_left = np.ceil(max(min(u0, min(u1, u2)), zero)) + from_column
         v_top = np.ceil(max(min(v0, min(v1, v2)), zero))
         left, top = np.int32(u_left), np.int32(v_top)
         right = np.int32(min(max(u0, max(u1, u2)), last_column))
-        bottom = np.int32(min(max(v0, max(v1, v2)), last_row))
+        # The picture's edge may have cut off the columns that are asked for.
+        bottom = np.int32(min(max(v0, max(v1, v2)), last_row)) if left <= right else top - 1
         # From here on in subpixels from the first pixel.
         x0, y0 = np.int32((u0 - u_left) * SUBPIXELS), np.int32((v0 - v_top) * SUBPIXELS)
         x1, y1 = np.int32((u1 - u_left) * SUBPIXELS), np.int32((v1 - v_top) * SUBPIXELS)
@@ -200,14 +212,14 @@ def fill_small(
         double_area = np.int32((x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0))
         turn = np.int32(1) if double_area > 0 else np.int32(-1)
         # Each edge's function, positive inside: its change by a subpixel to the right and down, and its start.
-        right_a, down_a = np.int32((y0 - y1) * turn), np.int32((x1 - x0) * turn)
-        right_b, down_b = np.int32((y1 - y2) * turn), np.int32((x2 - x1) * turn)
-        right_c, down_c = np.int32((y2 - y0) * turn), np.int32((x0 - x2) * turn)
-        edge_a = np.int32(-x0 * right_a - y0 * down_a)
-        edge_b = np.int32(-x1 * right_b - y1 * down_b)
-        edge_c = np.int32(-x2 * right_c - y2 * down_c)
-        right_a, right_b, right_c = np.int32(right_a * pixel), np.int32(right_b * pixel), np.int32(right_c * pixel)
-        down_a, down_b, down_c = np.int32(down_a * pixel), np.int32(down_b * pixel), np.int32(down_c * pixel)
+        per_x_0, per_y_0 = np.int32((y0 - y1) * turn), np.int32((x1 - x0) * turn)
+        per_x_1, per_y_1 = np.int32((y1 - y2) * turn), np.int32((x2 - x1) * turn)
+        per_x_2, per_y_2 = np.int32((y2 - y0) * turn), np.int32((x0 - x2) * turn)
+        edge_0 = np.int32(-x0 * per_x_0 - y0 * per_y_0)
+        edge_1 = np.int32(-x1 * per_x_1 - y1 * per_y_1)
+        edge_2 = np.int32(-x2 * per_x_2 - y2 * per_y_2)
+        per_x_0, per_x_1, per_x_2 = np.int32(per_x_0 * pixel), np.int32(per_x_1 * pixel), np.int32(per_x_2 * pixel)
+        per_y_0, per_y_1, per_y_2 = np.int32(per_y_0 * pixel), np.int32(per_y_1 * pixel), np.int32(per_y_2 * pixel)
         per_area = SUBPIXELS * SUBPIXELS / np.float32(double_area)
         w_per_u = ((w1 - w0) * (v2 - v0) - (w2 - w0) * (v1 - v0)) * per_area
         w_per_v = ((w2 - w0) * (u1 - u0) - (w1 - w0) * (u2 - u0)) * per_area
@@ -220,7 +232,7 @@ def fill_small(
             for lane in range(LANES):
                 x = np.int32(lane)
                 outside = (
-                    np.int32(edge_a + x * right_a) | np.int32(edge_b + x * right_b) | np.int32(edge_c + x * right_c)
+                    np.int32(edge_0 + x * per_x_0) | np.int32(edge_1 + x * per_x_1) | np.int32(edge_2 + x * per_x_2)
                 )
                 here = min(max(w + np.float32(x) * w_per_u, w_low), w_high)
                 before = nearest_w[at + np.uint64(lane)]
@@ -228,12 +240,12 @@ def fill_small(
             for lane in range(LANES):
                 x = np.int32(lane)
                 outside = (
-                    np.int32(edge_a + x * right_a) | np.int32(edge_b + x * right_b) | np.int32(edge_c + x * right_c)
+                    np.int32(edge_0 + x * per_x_0) | np.int32(edge_1 + x * per_x_1) | np.int32(edge_2 + x * per_x_2)
                 )
                 here = min(max(w + np.float32(x) * w_per_u, w_low), w_high)
                 before = farthest_w[at + np.uint64(lane)]
                 farthest_w[at + np.uint64(lane)] = here if (outside >= 0) & (here < before) else before
-            edge_a, edge_b, edge_c = np.int32(edge_a + down_a), np.int32(edge_b + down_b), np.int32(edge_c + down_c)
+            edge_0, edge_1, edge_2 = np.int32(edge_0 + per_y_0), np.int32(edge_1 + per_y_1), np.int32(edge_2 + per_y_2)
             w += w_per_v
             at += np.uint64(stride)
         first_row, end_row = min(first_row, top), max(end_row, bottom)
@@ -416,13 +428,18 @@ def draw_mesh(
     sort_faces(a, b, c, u_px, v_px, closed, np.float32(width - 1), np.float32(height - 1), kind)
     if before > 0:
         sort_cut_faces(a, b, c, z_m, near_m, kind)
-    smalls, larges = list_faces(kind, lists[0], lists[1])
+    smalls, wides, larges = list_faces(kind, lists[0], lists[1], lists[2])
+    flat_nearest_w, flat_farthest_w = nearest_w.reshape(-1), farthest_w.reshape(-1)
     fill_small(
-        lists[0, :smalls], a, b, c, u_px, v_px, w_per_m, width, height, stride,
-        nearest_w.reshape(-1), farthest_w.reshape(-1), rectangle,
+        lists[0, :smalls], np.float32(0.0), a, b, c, u_px, v_px, w_per_m, width, height, stride,
+        flat_nearest_w, flat_farthest_w, rectangle,
+    )  # fmt: skip
+    fill_small(
+        lists[1, :wides], np.float32(LANES), a, b, c, u_px, v_px, w_per_m, width, height, stride,
+        flat_nearest_w, flat_farthest_w, rectangle,
     )  # fmt: skip
     for n in range(larges):
-        f = lists[1, n]
+        f = lists[2, n]
         i, j, k = a[f], b[f], c[f]
         if z_m[i] >= near_m and z_m[j] >= near_m and z_m[k] >= near_m:
             # In float64 as after clipping, so that neighbours agree on where their edge crosses a row.
@@ -475,7 +492,7 @@ def draw_meshes(
     The buffers (H, at least width + LANES) are float32 of 1/m; what lies beyond `width` means nothing. `farthest_w` is
     of the farthest *drawn* surface. `rectangles` (M, 4) of the chosen are set to the pixels that each may have touched,
     first and last row, first and last column, empty (first > last) where it is not in view.
-    Scratch: `placed` (6, most vertices of a mesh), `kinds` (most faces,), `lists` (2, most faces + 1),
+    Scratch: `placed` (6, most vertices of a mesh), `kinds` (most faces,), `lists` (3, most faces + 1),
     `corners` (3, 3), `polygon` (4, 3).
     """
     for m in range(len(closed)):

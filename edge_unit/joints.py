@@ -25,6 +25,9 @@ SPEED_MAX = 2.0
 EXTRAPOLATION_MAX_S = 0.2
 """Beyond, the padding would have to grow by 0.1 rad: the robot would hide whoever stands beside it."""
 
+UNCERTAINTY_MAX = 0.1
+"""rad (or m); a robot that may be anywhere within more is reported, for the padding would hide who stands by."""
+
 CAPTURE_UNCERTAINTY_NS = 2 * NS_PER_MS
 """Exposure, and the path of a frame from the sensor to its time stamp."""
 
@@ -69,8 +72,9 @@ class JointHistory:
     def at(self, at_ns: int, clock_uncertainty_ns: int, stale_after_s: float) -> JointEstimate | None:
         """Where the joints were at `at_ns`; None when nothing near enough in time is known.
 
-        Between two samples it interpolates; after the newest it goes on at the last speed, for at most
-        `EXTRAPOLATION_MAX_S`, and what the robot's acceleration can change meanwhile is added to the uncertainty.
+        Between two samples it interpolates, after the newest it goes on at the last speed, both over at most
+        `EXTRAPOLATION_MAX_S`; what the robot's acceleration can change meanwhile is added to the uncertainty, and where
+        that exceeds `UNCERTAINTY_MAX` nothing is known.
         """
         newer: JointSample | None = None
         for sample in reversed(self._samples):
@@ -81,8 +85,12 @@ class JointHistory:
             newer = sample
         return None
 
-    def _between(self, before: JointSample, after: JointSample, at_ns: int, clock_uncertainty_ns: int) -> JointEstimate:
+    def _between(
+        self, before: JointSample, after: JointSample, at_ns: int, clock_uncertainty_ns: int
+    ) -> JointEstimate | None:
         gap_s = (after.at_ns - before.at_ns) / NS_PER_S
+        if gap_s > EXTRAPOLATION_MAX_S:
+            return None
         first, last = np.array(before.positions), np.array(after.positions)
         speed = np.abs(last - first) / gap_s
         share = (at_ns - before.at_ns) / (after.at_ns - before.at_ns)
@@ -120,7 +128,10 @@ class JointHistory:
 
 def _estimate(
     positions: NDArray[np.float64], speed: NDArray[np.float64], drift: float, clock_uncertainty_ns: int
-) -> JointEstimate:
+) -> JointEstimate | None:
+    """None when the positions are too uncertain to be of use."""
     time_s = (clock_uncertainty_ns + CAPTURE_UNCERTAINTY_NS) / NS_PER_S
     uncertainty = drift + speed * time_s
+    if not (uncertainty <= UNCERTAINTY_MAX).all():
+        return None
     return JointEstimate(positions, np.where(uncertainty < NEGLIGIBLE, 0.0, uncertainty))

@@ -334,7 +334,12 @@ class DepthPipeline:
 
     def _look_from(self, T_world_camera: Transform, settings: FilterSettings) -> Visibility:
         return Visibility(
-            self.intrinsics, T_world_camera, self.cell.box_min_m, self.cell.box_max_m, settings.seen_block_size_m
+            self.intrinsics,
+            T_world_camera,
+            self.cell.box_min_m,
+            self.cell.box_max_m,
+            settings.seen_block_size_m,
+            self.intrinsics.disparity_noise_m(settings.stereo_subpixel_px),
         )
 
     def _T_camera_link(self, joints: ArrayLike) -> NDArray[np.float64]:

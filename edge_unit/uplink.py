@@ -264,6 +264,8 @@ class Uplink:
         seen = None
         if report.seen is not None and self._acknowledged != (versions, seen_bits):
             seen = seen_report(report.seen)
+            # Until the master has answered nobody knows which of the two it holds.
+            self._acknowledged = None
         done = tuple(self._done[:MAX_COMMANDS])
         health = report.health
         if self.trouble is not None or self.warning is not None:

@@ -20,6 +20,9 @@ ROWS_LOOKED_AT = 360
 MAX_BLOCKS = 2**17
 """16 kB of bits before compression; in a cell that needs more, the blocks are larger."""
 
+SIGMAS = 2.0
+"""Standard deviations of depth by which a ray must be measured behind a block; obstacles in it then show."""
+
 
 @dataclass(frozen=True, eq=False)
 class SeenBlocks:
@@ -53,11 +56,14 @@ class Visibility:
         box_min_m: NDArray[np.float64],
         box_max_m: NDArray[np.float64],
         block_size_m: float,
+        noise_per_m: float,
     ) -> None:
+        """`noise_per_m` is the `c` of the camera's `sigma(z) = c * z**2`."""
         while np.ceil((box_max_m - box_min_m) / block_size_m).prod() > MAX_BLOCKS:
             block_size_m *= 2.0
         self.lattice = Lattice.covering(box_min_m, box_max_m, block_size_m)
         self._intrinsics = intrinsics
+        self._noise_per_m = SIGMAS * noise_per_m
         self._blocks = np.empty(self.lattice.cell_count, np.int32)
         self._views = np.empty((self.lattice.cell_count, 5), np.int32)
         self._seen = np.zeros(self.lattice.cell_count, np.uint8)
@@ -80,6 +86,7 @@ class Visibility:
             camera.width,
             camera.height,
             NEAR_PLANE_M,
+            self._noise_per_m,
             camera.depth_scale_m,
             self._blocks,
             self._views,

@@ -18,6 +18,10 @@ RAYS_PER_SIDE = 6
 """A block is probed by a grid of about 6 x 6 of its pixels: 5 % of them decide nothing, and it costs little."""
 
 
+BLOCKED_MAX = 1
+"""Rays that may end before a block's far side: one is noise, more may be a finger that is too thin to be reported."""
+
+
 @kernel
 def block_views(
     shape: NDArray[np.int32],
@@ -31,6 +35,7 @@ def block_views(
     width: int,
     height: int,
     near_m: float,
+    noise_per_m: float,
     depth_scale_m: float,
     blocks: NDArray[np.int32],
     views: NDArray[np.int32],
@@ -38,7 +43,8 @@ def block_views(
     """List the blocks that lie wholly in the picture, with the rectangle that each covers; returns how many.
 
     Blocks of `block_size_m` fill `shape` (3,) from `origin_m` (3,), numbered `(ix*ny + iy)*nz + iz`. Out, per listed
-    block: `blocks` its number; `views` (., 5) first and last row, first and last column, raw depth of its far corner.
+    block: `blocks` its number; `views` (., 5) first and last row, first and last column, raw depth of its far corner
+    plus the noise `noise_per_m * z**2` there: what stands just inside may be measured that much behind.
     """
     t = T_camera_world
     number = 0
@@ -60,7 +66,7 @@ def block_views(
                     v = (t[1, 0] * wx + t[1, 1] * wy + t[1, 2] * wz + t[1, 3]) / z * fy + cy
                     u_low, u_high = min(u_low, u), max(u_high, u)
                     v_low, v_high = min(v_low, v), max(v_high, v)
-                far_raw = math.ceil(z_high / depth_scale_m)
+                far_raw = math.ceil((z_high + noise_per_m * z_high * z_high) / depth_scale_m)
                 if z_low < near_m or far_raw > 65535 or u_low < 0.0 or v_low < 0.0:
                     continue
                 if u_high > width - 1 or v_high > height - 1:
@@ -97,7 +103,10 @@ def passes(
     far_raw: int,
     share_min: float,
 ) -> bool:
-    """Whether at least `share_min` of the rays that are probed inside a rectangle reach `far_raw`."""
+    """Whether at least `share_min` of the rays that are probed inside a rectangle reach `far_raw`.
+
+    Of the others any may be unmeasured, but at most `BLOCKED_MAX` may end before it: a thin thing blocks few.
+    """
     row_step = max((last_row - first_row) // RAYS_PER_SIDE, 1)
     column_step = np.uint64(max((last_column - first_column) // RAYS_PER_SIDE, 1))
     rows = (last_row - first_row) // row_step + 1
@@ -106,14 +115,16 @@ def passes(
     needed = share_min * probed
     far = np.uint16(far_raw)
     possible = probed
+    blocked = 0
     for y in range(first_row, last_row + 1, row_step):
         row = reach_raw[y]
         x = np.uint64(first_column)
         for _ in range(columns):
             possible -= row[x] < far
+            blocked += np.uint16(row[x] - np.uint16(1)) < np.uint16(far - np.uint16(1))
             x += column_step
         # Most blocks are seen wholly or not at all.
-        if possible < needed:
+        if possible < needed or blocked > BLOCKED_MAX:
             return False
     return True
 

@@ -17,7 +17,7 @@ FAR = np.full(CAMERA.shape, 65535, np.uint16)
 
 
 def look(depth: NDArray[np.uint16], limit: NDArray[np.uint16] = FAR, robot: NDArray[np.uint16] = FAR) -> SeenBlocks:
-    return Visibility(CAMERA, ABOVE, *BOX_M, 0.1).look(depth, limit, robot, 0.9)
+    return Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.0).look(depth, limit, robot, 0.9)
 
 
 def depth_of(blocks: SeenBlocks) -> NDArray[np.float64]:
@@ -59,7 +59,7 @@ def test_nothing_is_seen_through_what_hides_it(image: str) -> None:
 
 
 def test_a_report_is_not_overwritten_by_the_next() -> None:
-    visibility = Visibility(CAMERA, ABOVE, *BOX_M, 0.1)
+    visibility = Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.0)
     first = visibility.look(FAR, FAR, FAR, 0.9)
     number = first.seen.sum()
     visibility.look(np.zeros_like(FAR), FAR, FAR, 0.9)
@@ -67,7 +67,7 @@ def test_a_report_is_not_overwritten_by_the_next() -> None:
 
 
 def test_a_camera_that_moved_looks_elsewhere() -> None:
-    visibility = Visibility(CAMERA, ABOVE, *BOX_M, 0.1)
+    visibility = Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.0)
     visibility.place(look_at((0, 0, 1.7), (0, 0, 5.0)))
     assert not visibility.look(FAR, FAR, FAR, 0.9).seen.any()
     visibility.place(ABOVE)
@@ -97,6 +97,6 @@ def test_a_coarser_block_is_seen_where_all_its_parts_are(shape: tuple[int, int, 
 @pytest.mark.parametrize("size_m", [30.0, 150.0])
 def test_a_large_cell_has_larger_blocks(size_m: float) -> None:
     """150 m in blocks of 5 cm would be 27e9 of them."""
-    visibility = Visibility(CAMERA, ABOVE, np.zeros(3), np.full(3, size_m), 0.05)
+    visibility = Visibility(CAMERA, ABOVE, np.zeros(3), np.full(3, size_m), 0.05, 0.0)
     assert visibility.lattice.cell_count <= MAX_BLOCKS
     assert visibility.lattice.voxel_size_m * min(visibility.lattice.shape) >= size_m - 1e-6

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from edge_unit.kernels.seen import RAYS_PER_SIDE, block_views, seen_blocks
+from edge_unit.kernels.seen import BLOCKED_MAX, RAYS_PER_SIDE, block_views, seen_blocks
 from shared.camera import Intrinsics
 from shared.lattice import Lattice
 from shared.transforms import Transform, apply, from_xyz_rpy, inverse, look_at
 
 NEAR_M = 0.05
+NOISE_PER_M = 0.007
 CAMERA = Intrinsics(61, 43, 50.0, 52.0, 29.7, 21.2)
 LATTICE = Lattice((-0.6, -0.5, -0.2), 0.1, (12, 10, 5))
 ABOVE = look_at((0.1, -0.2, 1.7), (0.0, 0.0, 0.0))
@@ -35,6 +36,7 @@ def views(
         camera.width,
         camera.height,
         NEAR_M,
+        NOISE_PER_M,
         camera.depth_scale_m,
         blocks,
         rectangles,
@@ -51,7 +53,8 @@ def views_twin(lattice: Lattice, T_world_camera: Transform, camera: Intrinsics =
         if corners[:, 2].min() < NEAR_M:
             continue
         u, v = camera.project(corners).T
-        far_raw = math.ceil(corners[:, 2].max() / camera.depth_scale_m)
+        far_m = corners[:, 2].max()
+        far_raw = math.ceil((far_m + NOISE_PER_M * far_m * far_m) / camera.depth_scale_m)
         if u.min() < 0 or v.min() < 0 or u.max() > camera.width - 1 or v.max() > camera.height - 1 or far_raw > 65535:
             continue
         rectangle = (math.floor(v.min()), math.ceil(v.max()), math.floor(u.min()), math.ceil(u.max()))
@@ -106,7 +109,8 @@ def look_twin(
         rows = range(top, bottom + 1, max((bottom - top) // RAYS_PER_SIDE, 1))
         columns = range(left, right + 1, max((right - left) // RAYS_PER_SIDE, 1))
         rays = through[np.ix_(rows, columns)]
-        seen[key] = (rays >= far).sum() >= share * rays.size
+        blocked = ((rays > 0) & (rays < far)).sum()
+        seen[key] = (rays >= far).sum() >= share * rays.size and blocked <= BLOCKED_MAX
     return seen
 
 

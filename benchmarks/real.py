@@ -88,30 +88,45 @@ async def play_recording(folder: Path, images: RecordedSourceConfig) -> dict[int
     """The same frames as an SDK recording, through the RealSense source."""
     with tempfile.TemporaryDirectory(prefix="cellwatch-recording-") as scratch:
         recording, joints_file = Path(scratch) / "frames.db3", Path(scratch) / "joints.csv"
-        await asyncio.to_thread(record_images, images.model_copy(update={"fps": None}), recording, 1.0 / FRAME_S)
+        await asyncio.to_thread(record_images, images.model_copy(update={"fps": None}), recording)
         joints = np.loadtxt(folder / "joint_states_rad.csv", delimiter=",")
         np.savetxt(joints_file, joints[ORDER], delimiter=",", fmt="%.12f")
+        # Frame by frame: at its own pace the first would be over before the unit had its cell.
         source = RealsenseSourceConfig(
-            recording=recording, joints_file=joints_file, fx_stereo=real_frames.STEREO_FOCAL_PX
+            recording=recording, joints_file=joints_file, fx_stereo=real_frames.STEREO_FOCAL_PX, real_time=False
         )
         return await play(folder, source)
 
 
 async def play(folder: Path, source: SourceConfig) -> dict[int, SeenMap]:
-    """Have a real unit play the frames to a real master; returns the merged map of each frame that was watched."""
+    """Have a real unit play the frames to a real master; returns what each frame that was watched became.
+
+    Of images, which are shown at leisure, that is the merged map; of a recording what the unit reported, and the map of
+    the last frame.
+    """
     with tempfile.TemporaryDirectory(prefix="cellwatch-real-") as scratch:
         state = Path(scratch)
         async with Processes(state / "logs", without=(UNIT_PREFIX, MASTER_PREFIX)) as processes:
             ready = await _start_master(processes, state)
             unit = await _start_unit(processes, state, ready, folder, source)
             async with httpx.AsyncClient(base_url=ready["url"], headers=_operator(ready)) as client:
-                maps = await _watch(client, unit, isinstance(source, RealsenseSourceConfig))
+                if isinstance(source, RealsenseSourceConfig):
+                    await asyncio.wait_for(unit.process.wait(), READY_S)
+                    last = WATCHED_FRAMES[-1]
+                    maps = {last: SeenMap(await _voxels(client), 0.0)}
+                else:
+                    maps = await _watch(client, unit)
         first = 1 if isinstance(source, RealsenseSourceConfig) else 0
+        reported: dict[int, SeenMap] = {}
         for record in read_trace(state / "trace.msgpack"):
             frame = ORDER[record.frame_number - first]
-            if frame in maps and not np.array_equal(np.frombuffer(record.keys, "<u4"), maps[frame].keys):
+            keys = np.frombuffer(record.keys, "<u4")
+            reported[frame] = SeenMap(keys, record.process_ms)
+            if frame in maps and not np.array_equal(keys, maps[frame].keys):
                 raise SourceError(f"frame {frame}: the merged map is not what the only unit reported")
-    return maps
+    if missing := set(WATCHED_FRAMES) - set(reported):
+        raise SourceError(f"the unit did not report frames {sorted(missing)}; {unit.log_tail()}")
+    return {frame: maps.get(frame, reported[frame]) if first == 0 else reported[frame] for frame in WATCHED_FRAMES}
 
 
 def judge(frames: RealFrames, maps: dict[int, SeenMap], recorded: dict[int, SeenMap], out: Path) -> dict[str, Any]:
@@ -182,7 +197,7 @@ def _coloured(depth_m: NDArray[Any]) -> NDArray[np.uint8]:
     return image
 
 
-async def _watch(client: httpx.AsyncClient, unit: Child, counts_from_one: bool) -> dict[int, SeenMap]:
+async def _watch(client: httpx.AsyncClient, unit: Child) -> dict[int, SeenMap]:
     """Ask for the merged map until there is one of each watched frame."""
     maps: dict[int, SeenMap] = {}
     deadline_ns = monotonic_ns() + round((READY_S + len(ORDER) * FRAME_S) * NS_PER_S)
@@ -190,15 +205,20 @@ async def _watch(client: httpx.AsyncClient, unit: Child, counts_from_one: bool) 
         if monotonic_ns() > deadline_ns or unit.failed:
             raise SourceError(f"the unit did not show all frames, only {sorted(maps)}; {unit.log_tail()}")
         before = await _row(client)
-        answer = (await client.get("/voxels", params={"form": "keys"})).raise_for_status().json()
+        keys = await _voxels(client)
         after = await _row(client)
         if before is not None and after is not None and before["health"]["frame"] == after["health"]["frame"]:
-            place = after["health"]["frame"] - counts_from_one
-            if after["state"] == "live" and after["health"]["trouble"] is None and ORDER[place] in WATCHED_FRAMES:
-                keys = np.array(answer["voxels"], np.uint32)
-                maps[ORDER[place]] = SeenMap(keys, float(after["process_ms"]))
+            frame = ORDER[after["health"]["frame"]]
+            if after["state"] == "live" and after["health"]["trouble"] is None and frame in WATCHED_FRAMES:
+                maps[frame] = SeenMap(keys, float(after["process_ms"]))
         await asyncio.sleep(POLL_S)
     return maps
+
+
+async def _voxels(client: httpx.AsyncClient) -> NDArray[np.uint32]:
+    """Keys (N,) of the merged map."""
+    answer = (await client.get("/voxels", params={"form": "keys"})).raise_for_status().json()
+    return np.array(answer["voxels"], np.uint32)
 
 
 async def _row(client: httpx.AsyncClient) -> dict[str, Any] | None:

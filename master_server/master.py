@@ -83,13 +83,13 @@ class Master:
         """A unit asks for its slot (Algorithm 8).
 
         Raises:
-            Refusal: it speaks another contract, or there are too many units.
+            Refusal: it speaks another contract, its camera reports from elsewhere, or there are too many units.
         """
         if request.contract != CONTRACT_VERSION:
             raise Refusal(
                 400, f"contract: this master speaks version {CONTRACT_VERSION}, the unit {request.contract}"
             )
-        slot, retired = self.registry.initialize(request, ip)
+        slot, retired = self.registry.initialize(request, ip, now_ns, self.settings.stale_after_s)
         for gone in (slot, *retired):
             self._withdraw(gone.id)
         return InitializeAnswer(

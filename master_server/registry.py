@@ -181,16 +181,23 @@ class Registry:
     def __len__(self) -> int:
         return len(self._slots)
 
-    def initialize(self, request: InitializeRequest, ip: str) -> tuple[Slot, list[Slot]]:
+    def initialize(
+        self, request: InitializeRequest, ip: str, now_ns: int, stale_after_s: float
+    ) -> tuple[Slot, list[Slot]]:
         """The slot of this IP with a new session, and the slots that were retired for it.
 
-        A camera that turns up behind another IP retires its old slot; its pose moves along only within one boot of
-        the unit, for then merely the address changed. Another camera in a slot voids the pose.
+        A camera that turns up behind another IP retires its old slot, once that is silent for `stale_after_s`:
+        two cameras of one serial would otherwise evict each other for ever. Its pose moves along only within one
+        boot of the unit, for then merely the address changed. Another camera in a slot voids the pose.
 
         Raises:
-            Refusal: 503, there are MAX_UNITS already.
+            Refusal: 409, the camera reports from another IP right now; 503, there are MAX_UNITS already.
         """
         elsewhere = [slot for slot in self if slot.serial == request.serial and slot.ip != ip]
+        for old in elsewhere:
+            arrival_age_s = old.arrival_age_s(now_ns)
+            if arrival_age_s is not None and arrival_age_s <= stale_after_s:
+                raise Refusal(409, f"camera {request.serial} reports from IP {old.ip} (unit {old.id}) at this moment")
         slot = self._by_ip.get(ip)
         if slot is None:
             if len(self) - len(elsewhere) >= MAX_UNITS:

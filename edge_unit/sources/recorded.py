@@ -8,6 +8,7 @@ camera it can wait. Capture times are those of the delivery.
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import io
 import os
 import re
@@ -34,6 +35,12 @@ SUFFIXES = (".png", ".npz", ".npy")
 
 NPZ_NAME = "depth"
 """The array in an npz; any name will do when it is the only one."""
+
+SERIAL_NAME_CHARS = 64
+"""Of the folder's name in a serial: enough to recognise it, well within what a master takes."""
+
+SERIAL_HASH_CHARS = 8
+"""32 bits: among the units of a cell no two recordings share them by chance."""
 
 MAX_FILE_BYTES = 256 * 2**20
 """Of one image: many times the largest camera's, so that a wrong file does not fill the memory."""
@@ -165,7 +172,7 @@ def _open(config: RecordedSourceConfig) -> _Recording:
     pose, joints = folder / config.pose, folder / config.joints
     try:
         info = CameraInfo(
-            config.serial or folder.name,
+            config.serial or _serial(folder),
             "recorded",
             _intrinsics(folder / config.camera_info, config),
             read_pose(pose) if pose.is_file() else None,
@@ -176,6 +183,13 @@ def _open(config: RecordedSourceConfig) -> _Recording:
         raise SourceError(str(error)) from error
     rows = _joints(joints, len(every)) if joints.is_file() else None
     return _Recording(info, tuple(files), tuple(None if rows is None else rows[every.index(file)] for file in files))
+
+
+def _serial(folder: Path) -> str:
+    """Of a recording without one: two folders of the same name are two cameras."""
+    path = folder.resolve()
+    name = "".join(char if char.isprintable() else "_" for char in path.name)[:SERIAL_NAME_CHARS]
+    return f"{name}-{hashlib.sha256(os.fsencode(path)).hexdigest()[:SERIAL_HASH_CHARS]}"
 
 
 def _place(path: Path) -> list[str | int]:

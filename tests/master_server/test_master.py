@@ -16,6 +16,8 @@ from shared.timebase import Exchange
 from tests.master_server.fakes import AT_ORIGIN, GOOD, MS, START_NS, FakeUnit, S, joined, master, sees_all
 
 NOW_NS = START_NS + S
+LATER_NS = NOW_NS + 60 * S
+"""Whoever reported at `NOW_NS` and never since is silent by then."""
 
 
 def shown(one: Master, now_ns: int = NOW_NS) -> dict[int, int]:
@@ -76,7 +78,7 @@ def test_a_camera_at_a_new_ip_retires_its_old_slot() -> None:
     one = master()
     live(one, 1, 5)
     moved = FakeUnit(one, ip="10.0.0.9", serial="S1", boot_id="another boot")
-    assert moved.initialize(NOW_NS, pose=None).T_world_camera is None
+    assert moved.initialize(LATER_NS, pose=None).T_world_camera is None
     assert [row.ip for row in one.units(NOW_NS)] == ["10.0.0.9"]
     assert shown(one) == {}
 
@@ -85,7 +87,19 @@ def test_a_new_address_within_one_boot_keeps_the_pose() -> None:
     one = master()
     live(one, 1, 5)
     moved = FakeUnit(one, ip="10.0.0.9", serial="S1")
-    assert moved.initialize(NOW_NS, pose=None).T_world_camera == AT_ORIGIN
+    assert moved.initialize(LATER_NS, pose=None).T_world_camera == AT_ORIGIN
+
+
+def test_two_cameras_of_one_serial_do_not_evict_each_other() -> None:
+    one = master()
+    first = live(one, 1, 5)
+    twin = FakeUnit(one, ip="10.0.0.9", serial="S1")
+    with pytest.raises(Refusal, match=r"camera S1 reports from IP 10\.0\.0\.1 .*at this moment") as caught:
+        twin.initialize(NOW_NS + 100 * MS)
+    assert caught.value.status == 409
+    assert [row.ip for row in one.units(NOW_NS)] == ["10.0.0.1"]
+    first.update(NOW_NS + 200 * MS, [6])
+    assert shown(one, NOW_NS + 200 * MS) == {6: 1}
 
 
 def test_there_is_an_end_to_slots() -> None:

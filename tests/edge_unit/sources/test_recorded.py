@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -83,12 +85,21 @@ async def test_frames_are_paced(folder: Path) -> None:
 
 async def test_the_camera_is_described(folder: Path) -> None:
     info = await source(folder, depth_scale_m=0.0005, fx_stereo=7.0, stereo_baseline_m=0.095).open()
-    assert (info.serial, info.model) == ("set", "recorded")
+    assert re.fullmatch("set-[0-9a-f]{8}", info.serial)
+    assert info.model == "recorded"
     camera = info.intrinsics
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (4, 3, 5.0, 6.0, 1.5, 1.0)
     assert (camera.depth_scale_m, camera.stereo_focal_px, camera.stereo_baseline_m) == (0.0005, 7.0, 0.095)
     assert info.T_world_camera is not None
     assert (await source(folder, serial="X1").open()).serial == "X1"
+
+
+async def test_folders_of_one_name_are_two_cameras(folder: Path, tmp_path: Path) -> None:
+    twin = tmp_path / "elsewhere" / folder.name
+    shutil.copytree(folder, twin)
+    first, second = await source(folder).open(), await source(twin).open()
+    assert first.serial != second.serial
+    assert first.serial == (await source(folder / ".." / folder.name).open()).serial
 
 
 async def test_pose_and_joints_may_be_missing(folder: Path) -> None:

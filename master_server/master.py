@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from master_server.coverage import Coverage
+from master_server.coverage import Coverage, blocks_of
 from master_server.merge import NO_KEYS, MergedMap
 from master_server.registry import Registry, Slot
 from master_server.robot import RobotJoints
@@ -75,7 +75,7 @@ class Master:
         self.registry = Registry()
         self.robot = RobotJoints(cell.robot.joint_names if cell.robot else None)
         self._documents()
-        self._lattices()
+        self._begin_on(cell.lattice(settings.voxel_size_m), blocks_of(cell, settings.seen_block_size_m))
 
     # ------------------------------------------------------------------ units
 
@@ -231,7 +231,7 @@ class Master:
 
         Raises:
             Refusal: 422, a name is unknown or a value out of range.
-            InputError: the cell would need too many voxels of that size.
+            InputError: the cell would need too many voxels of that size; nothing was changed.
         """
         try:
             settings = Settings.model_validate({**self.settings.model_dump(), **changes})
@@ -240,7 +240,7 @@ class Master:
         if settings == self.settings:
             return settings
         lattice = self.cell.lattice(settings.voxel_size_m)
-        blocks_change = settings.seen_block_size_m != self.settings.seen_block_size_m
+        blocks = blocks_of(self.cell, settings.seen_block_size_m)
         lattice_changes = lattice != self.lattice
         self.settings = settings
         self.versions = Versions(
@@ -248,8 +248,8 @@ class Master:
             lattice=self.versions.lattice + lattice_changes,
             cell=self.versions.cell,
         )
-        if lattice_changes or blocks_change:
-            self._lattices()
+        if lattice_changes or blocks != self.coverage.blocks:
+            self._begin_on(lattice, blocks)
         return settings
 
     # ------------------------------------------------------------------ inside
@@ -258,12 +258,12 @@ class Master:
         self.cell_document, self.meshes = self.cell.to_document()
         self.cell_reference = CellReference(name=self.cell.name, sha256=self.cell.version)
 
-    def _lattices(self) -> None:
-        """Begin on the lattice and blocks that settings and cell ask for; all that was reported is void."""
-        self.lattice = self.cell.lattice(self.settings.voxel_size_m)
+    def _begin_on(self, lattice: Lattice, blocks: Lattice) -> None:
+        """Begin on another lattice and blocks; all that was reported is void."""
+        self.lattice = lattice
         self.lattice_description = LatticeDescription.of(self.lattice)
         self.map = MergedMap(self.lattice)
-        self.coverage = Coverage(self.cell.lattice(self.settings.seen_block_size_m))
+        self.coverage = Coverage(blocks)
         for slot in self.registry:
             slot.keys = NO_KEYS
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from master_server.master import Master
 from master_server.registry import FPS_FRAMES, MAX_UNITS
 from shared.errors import InputError, Refusal, WireError
+from shared.lattice import Lattice
 from shared.messages import MAX_COMMANDS, Health, JointsRequest, Versions
 from shared.timebase import Exchange
 from tests.master_server.fakes import AT_ORIGIN, GOOD, MS, START_NS, FakeUnit, S, joined, master, sees_all
@@ -425,6 +426,22 @@ def test_a_lattice_that_would_be_too_large_changes_nothing() -> None:
     with pytest.raises(InputError, match="larger voxels"):
         one.change_settings({"voxel_size_m": 0.01})
     assert one.settings.voxel_size_m == 0.05
+
+
+def test_settings_that_are_refused_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = master()
+    unit = live(one, 1, 5)
+    before = (one.settings, one.versions, one.lattice, one.coverage.blocks)
+
+    def refuse(*_: Any) -> Lattice:
+        raise InputError("no such blocks")
+
+    monkeypatch.setattr("master_server.master.blocks_of", refuse)
+    with pytest.raises(InputError):
+        one.change_settings({"voxel_size_m": 0.04, "seen_block_size_m": 0.05})
+    assert (one.settings, one.versions, one.lattice, one.coverage.blocks) == before
+    assert state(one, unit) == ("live", "")
+    assert shown(one) == {5: 1}
 
 
 def test_other_blocks_void_what_was_seen() -> None:

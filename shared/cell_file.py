@@ -207,6 +207,8 @@ def read_cell_file(path: str | Path) -> CellFile:
         raise CellError(f"{file}: {line}expected YAML, got a fault: {error.problem}") from error
     except yaml.YAMLError as error:
         raise CellError(f"{file}: expected YAML, got a fault: {' '.join(str(error).split())}") from error
+    except RecursionError as error:
+        raise CellError(f"{file}: expected keys and values in a few levels, got them nested too deeply") from error
     if not isinstance(content, dict):
         raise CellError(f"{file}: expected keys and values, got {type(content).__name__}")
     try:

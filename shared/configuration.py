@@ -82,11 +82,18 @@ def sentence_of(items: Sequence[Mapping[str, Any]]) -> str:
         # A name may be a stranger's: as text in one line, and not without end.
         name = repr(name)[1:-1][:SENTENCE_INPUT_CHARS]
         what = item["msg"][:1].lower() + item["msg"][1:]
-        came = f", got {repr(item['input'])[:SENTENCE_INPUT_CHARS]}" if item["type"] != "missing" else ""
+        came = f", got {_shown(item['input'])}" if item["type"] != "missing" else ""
         parts.append(f"{name}: {what}{came}")
     if len(items) > len(parts):
         parts.append(f"and {len(items) - len(parts)} more")
     return "; ".join(parts)
+
+
+def _shown(value: Any) -> str:
+    try:
+        return repr(value)[:SENTENCE_INPUT_CHARS]
+    except RecursionError:
+        return f"a {type(value).__name__} nested too deeply to show"
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -96,6 +103,8 @@ def _read(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: cannot be read: {error}") from error
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: no YAML: {' '.join(str(error).split())}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{path}: expected values in a few levels, got them nested too deeply") from error
     if loaded is None:
         return {}
     if not isinstance(loaded, dict):
@@ -110,6 +119,8 @@ def _scalar(value: Any, name: str) -> Any:
         return yaml.safe_load(value)
     except yaml.YAMLError as error:
         raise ConfigError(f"{name}: no YAML value: {value!r}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{name}: expected a value in a few levels, got one nested too deeply") from error
 
 
 def _put(tree: dict[str, Any], dotted: str, value: Any, name: str) -> None:

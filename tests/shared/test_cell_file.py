@@ -256,3 +256,8 @@ def test_integers_are_lengths_too(tmp_path: Path) -> None:
     content: Any = read_cell_file(written(tmp_path, MINIMAL + "static: [{name: a, box: [1, 2, 3]}]\n"))
     assert content.static[0].box == (1.0, 2.0, 3.0)
     np.testing.assert_array_equal(content.static[0].pose.transform(), np.eye(4))
+
+
+def test_values_nested_too_deeply_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(CellError, match=r"cell\.yaml: .*nested too deeply"):
+        read_cell_file(written(tmp_path, MINIMAL + "static: " + "[" * 3000 + "]" * 3000 + "\n"))

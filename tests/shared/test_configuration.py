@@ -71,3 +71,13 @@ def test_assignments() -> None:
     assert assignments(["a.b=1", "c=x=y"]) == {"a.b": "1", "c": "x=y"}
     with pytest.raises(ConfigError, match="--set a"):
         assignments(["a"])
+
+
+def test_values_nested_too_deeply_are_refused(tmp_path: Path) -> None:
+    deep = "[" * 3000 + "]" * 3000
+    file = tmp_path / "a.yaml"
+    file.write_text(f"name: {deep}")
+    with pytest.raises(ConfigError, match=r"a\.yaml: .*nested too deeply"):
+        load(Outer, file, {}, "T_", {})
+    with pytest.raises(ConfigError, match=r"name: .*nested too deeply"):
+        load(Outer, None, {}, "T_", {"name": deep})

@@ -58,6 +58,10 @@ async def _refused(request: Request, error: Exception) -> Response:
 
 async def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
-    return JSONResponse({"detail": sentence_of(error.errors())}, 422)
+    items = error.errors()
+    if items and items[0]["type"] == "json_invalid":
+        reason = items[0].get("ctx", {}).get("error", "it is malformed")
+        return JSONResponse({"detail": f"body: expected JSON, got none: {reason} at {items[0]['loc'][-1]}"}, 422)
+    return JSONResponse({"detail": sentence_of(items)}, 422)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
 from shared.camera import Intrinsics
 from shared.errors import InputError
@@ -27,6 +27,9 @@ MAX_TEXT = 200
 MAX_JOINTS = 32
 """More than two arms on a track with grippers have."""
 
+MAX_JOINT_VALUE = 1e4
+"""Of a position in rad or m, or a velocity: 1600 turns. No robot is there, and on the wire it must fit a float32."""
+
 MAX_VOXELS = 2**18
 """In one update: a wall that is in no CAD, 5 m by 5 m at 10 mm, still fits; 1 MiB on the wire."""
 
@@ -39,11 +42,23 @@ MAX_COMMANDS = 16
 MAX_JOINT_SAMPLES = 32
 """In one answer: a slow unit at 5 fps gets all that it needs at one sample in 8 ms."""
 
+
+
+def _printable(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("expected printable characters only, since it is written into logs")
+    return text
+
+
 Text = Annotated[str, Field(max_length=MAX_TEXT)]
+Label = Annotated[Text, AfterValidator(_printable)]
 Nanoseconds = Annotated[int, Field(ge=0, lt=2**63)]
 Counter = Annotated[int, Field(ge=0, lt=2**63)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 JointValues = Annotated[tuple[float, ...], Field(max_length=MAX_JOINTS)]
+# Strict, for true is no angle.
+JointNumber = Annotated[float, Field(strict=True, ge=-MAX_JOINT_VALUE, le=MAX_JOINT_VALUE)]
+JointNumbers = Annotated[tuple[JointNumber, ...], Field(max_length=MAX_JOINTS)]
 Matrix = tuple[
     tuple[float, float, float, float],
     tuple[float, float, float, float],
@@ -115,11 +130,11 @@ class InitializeRequest(Message):
     """A unit with its camera asks for its slot (Algorithm 8)."""
 
     contract: int = Field(ge=0, lt=2**31)
-    serial: str = Field(min_length=1, max_length=MAX_TEXT, description="Serial number of the camera.")
-    model: Text = ""
+    serial: Label = Field(min_length=1, description="Serial number of the camera.")
+    model: Label = ""
     intrinsics: Intrinsics
-    software: Text = ""
-    boot_id: Text = Field(default="", description="Changes when the unit's monotonic clock starts anew.")
+    software: Label = ""
+    boot_id: Label = Field(default="", description="Changes when the unit's monotonic clock starts anew.")
     sent_at_ns: Nanoseconds
 
 
@@ -224,8 +239,8 @@ class PoseAnswer(Message):
 class JointsRequest(Message):
     """`PUT /robot/joints`: positions in rad (m if prismatic); without a time they count from their arrival."""
 
-    positions: JointValues
-    velocities: JointValues | None = None
+    positions: JointNumbers
+    velocities: JointNumbers | None = None
     at_ns: Nanoseconds | None = Field(default=None, description="By the master's clock, see `GET /robot`.")
 
 

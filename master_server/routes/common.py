@@ -14,7 +14,7 @@ from fastapi.security import HTTPBearer
 from starlette.requests import ClientDisconnect
 from starlette.types import Message, Scope
 
-from master_server.access import OPERATORS, UNITS, Access, Role
+from master_server.access import ANYONE, OPERATORS, UNITS, Access, Role
 from master_server.master import Master
 from shared.errors import Refusal, WireError
 from shared.waiting import within
@@ -142,6 +142,8 @@ async def _as_json(request: Request) -> Request:
     """The same request with its body read within bounds, and as JSON if it was msgpack."""
     if request.method in ("GET", "DELETE", "HEAD"):
         return request
+    # Before anything is read, so that a stranger costs nothing; whose token it must be, each route checks.
+    access_of(request).check(authorization_of(request), ANYONE)
     body = await body_of(request, MAX_BODY_BYTES)
     headers = request.scope["headers"]
     if request.headers.get("content-type", "").split(";")[0].strip() == MEDIA_TYPE:
@@ -149,6 +151,8 @@ async def _as_json(request: Request) -> Request:
             body = json.dumps(unpack(body, MAX_BODY_BYTES)).encode()
         except (TypeError, ValueError) as error:
             raise WireError(f"body: expected msgpack of what JSON can hold: {error}") from error
+        except RecursionError as error:
+            raise WireError("body: expected values in a few levels, got them nested too deeply") from error
         headers = [(name, value) for name, value in headers if name not in (b"content-type", b"content-length")]
         headers += [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
 

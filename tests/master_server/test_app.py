@@ -207,6 +207,9 @@ async def test_a_unit_tells_its_own_pose_and_an_operator_any(desk: Desk) -> None
         ("/settings", [1], "value: "),
         ("/robot/joints", {"positions": [1.0]}, "positions: expected 2 numbers"),
         ("/robot/joints", {"positions": ["x", 1]}, "positions.0: "),
+        ("/robot/joints", {"positions": [1e300, 1]}, "positions.0: input should be less than or equal to 10000"),
+        ("/robot/joints", {"positions": [1, 1], "velocities": [0, -1e39]}, "velocities.1: "),
+        ("/robot/joints", {"positions": [True, 1]}, "positions.0: "),
         ("/robot/joints", {"positions": [1.0, 2.0], "speed": 1}, "speed: "),
         ("/robot/joints", {}, "positions: field required"),
         ("/units/x/pose", {"T_world_camera": AT_ORIGIN}, "path.unit_id: "),
@@ -229,6 +232,42 @@ async def test_bodies_that_are_no_json_are_refused(desk: Desk, body: bytes) -> N
 async def test_bodies_that_are_no_msgpack_are_refused(desk: Desk, body: bytes) -> None:
     response = await desk.call("PUT", "/robot/joints", content=body, headers=MSGPACK)
     assert response.status_code == 422
+
+
+@pytest.mark.parametrize("path", ["/robot/joints", "/settings"])
+@pytest.mark.parametrize("depth", [100, 500, 900, 1000, 20_000])
+async def test_bodies_nested_too_deeply_are_refused_in_one_sentence(desk: Desk, path: str, depth: int) -> None:
+    packed = b"\x81\xa9positions" + b"\x91" * depth + b"\xc0"
+    text = b'{"positions": ' + b"[" * depth + b"]" * depth + b"}"
+    for body, headers in ((packed, MSGPACK), (text, {"Content-Type": "application/json"})):
+        response = await desk.call("PUT", path, content=body, headers=headers)
+        assert response.status_code in (400, 422)
+        assert isinstance(response.json()["detail"], str)
+
+
+@pytest.mark.parametrize("token", [None, "wrong-token-0123456789"])
+async def test_nothing_is_read_of_a_body_without_a_token(desk: Desk, token: str | None) -> None:
+    async def never() -> AsyncIterator[bytes]:
+        raise AssertionError("the body was read")
+        yield b""
+
+    for method, path in (("POST", "/initialize"), ("PUT", "/settings"), ("POST", "/update")):
+        assert (await desk.call(method, path, token, content=never(), headers=MSGPACK)).status_code == 401
+
+
+async def test_what_is_no_json_is_said_of_the_body(desk: Desk) -> None:
+    response = await desk.call("PUT", "/settings", content=b"{", headers={"Content-Type": "application/json"})
+    assert response.status_code == 422
+    assert response.json()["detail"].startswith("body: expected JSON")
+
+
+@pytest.mark.parametrize("field", ["serial", "model", "software", "boot_id"])
+async def test_a_unit_cannot_write_lines_into_logs(desk: Desk, field: str) -> None:
+    body = FakeUnit(desk.app.state.master).introduction(monotonic_ns()).model_dump() | {field: "A\nERROR \x1b[2J"}
+    response = await desk.call("POST", "/initialize", UNIT, content=msgpack.packb(body), headers=MSGPACK)
+    assert response.status_code == 422
+    assert field in response.json()["detail"]
+    assert "\n" not in response.json()["detail"]
 
 
 async def test_msgpack_both_ways(desk: Desk) -> None:

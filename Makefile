@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps source-faults test lint clean libusb
+.PHONY: help demo real sweeps source-faults pictures test lint clean libusb
 
 ARGS ?=
 EXTRAS := edge,master,realsense,sim,dev
@@ -20,7 +20,7 @@ export CELLWATCH_DATA ?= $(abspath ../shared/data)
 endif
 
 help: ## this list
-	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1 \t\2/p' Makefile | expand -t 20
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1 \t\2/p' Makefile | expand -t 24
 	@echo 'Arguments go through ARGS: make demo ARGS="--seconds 20". Another Python: make PYTHON=python3.12 ...'
 
 demo: $(READY) ## a simulated cell with a moving robot, people and many cameras

@@ -87,6 +87,7 @@ class Unit:
         self._applied: Assignment | None = None
         self._learning: _Learning | None = None
         self._next_at_ns = 0
+        self._trouble: str | None = "no frame yet"
         self.uplink = Uplink(
             self._client,
             CellCache(config.state_dir / "cell"),
@@ -134,6 +135,12 @@ class Unit:
                     if isinstance(frames, AsyncGenerator):
                         await frames.aclose()
                 await self.uplink.drained(DRAIN_S)
+                learning = self._learning
+                if learning is None:
+                    logger.info("the recording has come to its end")
+                else:
+                    done, wanted = learning.learner.frames, learning.frames
+                    logger.warning("the recording ended after %d of the %d frames to be learned", done, wanted)
                 return
             except SourceError as error:
                 if _is_recording(self._config.source):
@@ -199,6 +206,9 @@ class Unit:
         joints = await self._joints_at(assignment, frame)
         commands = self._take_commands()
         report = await asyncio.to_thread(self._process, assignment, assignment.T_world_camera, frame, joints, commands)
+        if (report.health.trouble is None) != (self._trouble is None):
+            logger.info("%s", report.health.trouble or "frames are filtered and reported")
+        self._trouble = report.health.trouble
         self.uplink.offer(report)
 
     async def _joints_at(self, assignment: Assignment, frame: DepthFrame) -> JointEstimate | None:

@@ -63,5 +63,3 @@ async def _invalid(request: Request, error: Exception) -> Response:
         reason = items[0].get("ctx", {}).get("error", "it is malformed")
         return JSONResponse({"detail": f"body: expected JSON, got none: {reason} at {items[0]['loc'][-1]}"}, 422)
     return JSONResponse({"detail": sentence_of(items)}, 422)
-
-

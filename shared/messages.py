@@ -43,7 +43,6 @@ MAX_JOINT_SAMPLES = 32
 """In one answer: a slow unit at 5 fps gets all that it needs at one sample in 8 ms."""
 
 
-
 def _printable(text: str) -> str:
     if not text.isprintable():
         raise ValueError("expected printable characters only, since it is written into logs")

@@ -68,7 +68,9 @@ class RecordedSourceConfig(BaseModel):
     depth_scale_m: float = Field(default=0.001, ge=1e-6, le=0.1)
     fx_stereo: float | None = Field(default=None, gt=0.0, description="Focal length at which the imagers match.")
     stereo_baseline_m: float = Field(default=D435_BASELINE_M, ge=0.005, le=1.0)
-    serial: str | None = Field(default=None, min_length=1, max_length=200, description="Absent: the folder's name.")
+    serial: str | None = Field(
+        default=None, min_length=1, max_length=200, description="Absent: the folder's name and a hash of its path."
+    )
     camera_info: str = "camera_info.yaml"
     pose: str = Field(default="T_base_optical.txt", description="T_world_camera; none where there is no such file.")
     joints: str = Field(default="joint_states_rad.csv", description="A row a frame; none where there is no such file.")

@@ -22,6 +22,15 @@ MAX_CELLS = 2**27
 MAX_AXIS = 2**15 - 1
 """Indices travel as int16."""
 
+MAX_INDEX = 2.0**53
+"""Up to here a float64 tells one index from the next."""
+
+NUMBERS, INTEGERS = "iuf", "iu"
+"""Kinds of numpy's dtypes: text, objects and booleans are no numbers, and a fraction is never cut off."""
+
+SHOWN_CHARS = 60
+"""Enough of a wrong value to recognise it."""
+
 EDGE_TOLERANCE = 1e-6
 """A box of 3.0 m at 0.1 m has 30 voxels, although 3.0 / 0.1 is 30.000000000000004 in floating point."""
 
@@ -35,21 +44,23 @@ class Lattice:
     shape: tuple[int, int, int]
 
     def __post_init__(self) -> None:
-        origin = tuple(float(value) for value in self.origin_m)
-        shape = tuple(int(count) for count in self.shape)
-        if len(origin) != 3 or not np.isfinite(origin).all():
-            raise InputError(f"lattice origin_m: expected three finite numbers, got {self.origin_m}")
-        if not (np.isfinite(self.voxel_size_m) and self.voxel_size_m > 0.0):
-            raise InputError(f"lattice voxel_size_m: expected a positive length, got {self.voxel_size_m}")
-        if len(shape) != 3 or min(shape) < 1 or max(shape) > MAX_AXIS:
-            raise InputError(f"lattice shape: expected three counts of 1 to {MAX_AXIS}, got {self.shape}")
+        corner = _numbers(self.origin_m, "lattice origin_m", "three finite numbers")
+        if corner.shape != (3,) or not np.isfinite(corner).all():
+            raise InputError(f"lattice origin_m: expected three finite numbers, got {_shown(self.origin_m)}")
+        size = _length(self.voxel_size_m, "lattice voxel_size_m")
+        wanted = f"three counts of 1 to {MAX_AXIS}"
+        counts = _numbers(self.shape, "lattice shape", wanted, INTEGERS)
+        if counts.shape != (3,) or counts.min() < 1 or counts.max() > MAX_AXIS:
+            raise InputError(f"lattice shape: expected {wanted}, got {_shown(self.shape)}")
+        origin = tuple(float(value) for value in corner)
+        shape = tuple(int(count) for count in counts)
         if int(np.prod(shape, dtype=np.int64)) > MAX_CELLS:
             raise InputError(
-                f"lattice of {shape[0]} x {shape[1]} x {shape[2]} voxels of {self.voxel_size_m} m: "
+                f"lattice of {shape[0]} x {shape[1]} x {shape[2]} voxels of {size} m: "
                 f"expected at most {MAX_CELLS}, choose larger voxels or a smaller box"
             )
         object.__setattr__(self, "origin_m", origin)
-        object.__setattr__(self, "voxel_size_m", float(self.voxel_size_m))
+        object.__setattr__(self, "voxel_size_m", size)
         object.__setattr__(self, "shape", shape)
 
     @classmethod
@@ -57,20 +68,20 @@ class Lattice:
         """The smallest lattice from `box_min_m` that covers the box up to `box_max_m`.
 
         Raises:
-            InputError: the box is empty, or it would need more than `MAX_CELLS` voxels.
+            InputError: the box is empty, or it would need more than `MAX_CELLS` voxels, or these are no numbers.
         """
-        low = np.asarray(box_min_m, dtype=np.float64)
-        high = np.asarray(box_max_m, dtype=np.float64)
+        low = _numbers(box_min_m, "box_min_m", "three finite numbers").astype(np.float64)
+        high = _numbers(box_max_m, "box_max_m", "three finite numbers").astype(np.float64)
         if low.shape != (3,) or high.shape != (3,) or not (high > low).all() or not np.isfinite((low, high)).all():
             raise InputError(f"box: expected min below max on three axes, got {low.tolist()} to {high.tolist()}")
-        if not voxel_size_m > 0.0:
-            raise InputError(f"voxel_size_m: expected a positive length, got {voxel_size_m}")
-        counts = np.ceil((high - low) / voxel_size_m - EDGE_TOLERANCE)
+        size = _length(voxel_size_m, "voxel_size_m")
+        with np.errstate(over="ignore"):
+            counts = np.ceil((high - low) / size - EDGE_TOLERANCE)
         # Both ends fit an int64; a number of voxels near the upper one is refused below.
         counts = np.clip(counts, 1, 2**53).astype(np.int64)
         return cls(
             (float(low[0]), float(low[1]), float(low[2])),
-            voxel_size_m,
+            size,
             (int(counts[0]), int(counts[1]), int(counts[2])),
         )
 
@@ -81,25 +92,47 @@ class Lattice:
         return nx * ny * nz
 
     def index(self, points_m: NDArray[Any]) -> NDArray[np.int64]:
-        """Indices (..., 3) of the voxels that hold the world points (..., 3) in metres; not clipped to the shape."""
-        return np.floor((np.asarray(points_m) - self.origin_m) / self.voxel_size_m).astype(np.int64)
+        """Indices (..., 3) of the voxels that hold the world points (..., 3) in metres; not clipped to the shape.
+
+        Raises:
+            InputError: these are no points of three finite numbers.
+        """
+        points = _triples(points_m, "points_m", NUMBERS)
+        with np.errstate(over="ignore"):
+            found = np.floor((points - self.origin_m) / self.voxel_size_m)
+        if not (np.abs(found) < MAX_INDEX).all():
+            raise InputError("points_m: expected finite numbers within reach of the lattice, got NaN, infinity or more")
+        return found.astype(np.int64)
 
     def contains(self, indices: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which of the indices (..., 3) lie on the lattice, (...) bool."""
-        found = np.asarray(indices)
+        """Which of the indices (..., 3) lie on the lattice, (...) bool.
+
+        Raises:
+            InputError: these are no triples of numbers.
+        """
+        found = _triples(indices, "indices", NUMBERS)
         return np.asarray(((found >= 0) & (found < self.shape)).all(axis=-1))
 
     def centres(self, indices: NDArray[Any]) -> NDArray[np.float64]:
-        """World positions (..., 3) in metres of the middles of the voxels at `indices` (..., 3)."""
-        return np.asarray(self.origin_m) + (np.asarray(indices, dtype=np.float64) + 0.5) * self.voxel_size_m
+        """World positions (..., 3) in metres of the middles of the voxels at `indices` (..., 3).
+
+        Raises:
+            InputError: these are no triples of numbers.
+        """
+        return (
+            np.asarray(self.origin_m)
+            + (_triples(indices, "indices", NUMBERS).astype(np.float64) + 0.5) * self.voxel_size_m
+        )
 
     def keys(self, indices: NDArray[Any]) -> NDArray[np.uint32]:
         """Keys (N,) of indices (N, 3), in the order given.
 
         Raises:
-            InputError: an index lies outside the lattice.
+            InputError: an index lies outside the lattice, or these are no triples of integers.
         """
-        found = np.asarray(indices, dtype=np.int64).reshape(-1, 3)
+        found = _triples(indices, "indices", INTEGERS).astype(np.int64)
+        if found.ndim != 2:
+            raise InputError(f"indices: expected shape (N, 3), got {found.shape}")
         if not self.contains(found).all():
             raise InputError(f"indices: expected 0 <= index < {self.shape}, got some outside")
         _, ny, nz = self.shape
@@ -109,10 +142,42 @@ class Lattice:
         """Indices (N, 3) int16 of keys (N,).
 
         Raises:
-            InputError: a key lies outside the lattice.
+            InputError: a key lies outside the lattice, or these are no integers.
         """
-        found = np.asarray(keys, dtype=np.int64).reshape(-1)
+        found = _numbers(keys, "keys", "integers", INTEGERS).astype(np.int64).reshape(-1)
         if found.size and (found.min() < 0 or found.max() >= self.cell_count):
             raise InputError(f"keys: expected 0 <= key < {self.cell_count}, got {found.min()} to {found.max()}")
         _, ny, nz = self.shape
         return np.stack((found // (ny * nz), found // nz % ny, found % nz), axis=-1).astype(np.int16)
+
+
+def _numbers(value: ArrayLike, name: str, expected: str, kinds: str = NUMBERS) -> NDArray[Any]:
+    """`value` as an array whose dtype is of one of `kinds`; an empty list has no dtype of its own."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected {expected}, got {_shown(value)}") from error
+    if array.dtype.kind not in kinds and not (array.size == 0 and array.dtype.kind in NUMBERS):
+        raise InputError(f"{name}: expected {expected}, got {_shown(value)}")
+    return array
+
+
+def _triples(value: ArrayLike, name: str, kinds: str) -> NDArray[Any]:
+    """`value` as an array (..., 3)."""
+    array = _numbers(value, name, "integers" if kinds == INTEGERS else "numbers", kinds)
+    if array.shape[-1:] != (3,):
+        raise InputError(f"{name}: expected three values on the last axis, got shape {array.shape}")
+    return array
+
+
+def _length(value: float, name: str) -> float:
+    """`value` as a positive, finite float."""
+    array = _numbers(value, name, "a positive length")
+    if array.shape != () or not (np.isfinite(array) and array > 0.0):
+        raise InputError(f"{name}: expected a positive length, got {_shown(value)}")
+    return float(array)
+
+
+def _shown(value: object) -> str:
+    """`value` in one short line."""
+    return " ".join(repr(value).split())[:SHOWN_CHARS]

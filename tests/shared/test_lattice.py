@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -161,6 +162,69 @@ def test_impossible_lattices_are_refused(
 def test_impossible_boxes_are_refused(low: tuple[float, ...], high: tuple[float, ...], size: float) -> None:
     with pytest.raises(InputError):
         Lattice.covering(low, high, size)
+
+
+@pytest.mark.parametrize(
+    ("origin", "size", "shape", "message"),
+    [
+        ("abc", 0.1, (1, 1, 1), "lattice origin_m: expected three finite numbers, got 'abc'"),
+        (None, 0.1, (1, 1, 1), "lattice origin_m: expected three finite numbers, got None"),
+        ((0, (1, 2), 0), 0.1, (1, 1, 1), "lattice origin_m: expected three finite numbers, got (0, (1, 2), 0)"),
+        ((0, 0, 0), "x", (1, 1, 1), "lattice voxel_size_m: expected a positive length, got 'x'"),
+        ((0, 0, 0), None, (1, 1, 1), "lattice voxel_size_m: expected a positive length, got None"),
+        ((0, 0, 0), 0.1, None, "lattice shape: expected three counts of 1 to 32767, got None"),
+        ((0, 0, 0), 0.1, ("a", 1, 1), "lattice shape: expected three counts of 1 to 32767, got ('a', 1, 1)"),
+        ((0, 0, 0), 0.1, (math.nan, 1, 1), "lattice shape: expected three counts of 1 to 32767, got (nan, 1, 1)"),
+        ((0, 0, 0), 0.1, (1.9, 1, 1), "lattice shape: expected three counts of 1 to 32767, got (1.9, 1, 1)"),
+        ((0, 0, 0), 0.1, (), "lattice shape: expected three counts of 1 to 32767, got ()"),
+    ],
+)
+def test_what_is_no_lattice_is_one_clear_error(origin: Any, size: Any, shape: Any, message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Lattice(origin, size, shape)
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "size", "message"),
+    [
+        ("a", (1, 1, 1), 0.1, "box_min_m: expected three finite numbers, got 'a'"),
+        ((0, 0, 0), None, 0.1, "box_max_m: expected three finite numbers, got None"),
+        ((0, 0, 0), (1, 1, 1), None, "voxel_size_m: expected a positive length, got None"),
+        ((0, 0, 0), (1, 1, 1), "x", "voxel_size_m: expected a positive length, got 'x'"),
+    ],
+)
+def test_what_is_no_box_is_one_clear_error(low: Any, high: Any, size: Any, message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Lattice.covering(low, high, size)
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("call", "value", "message"),
+    [
+        ("index", np.zeros((4, 2)), "points_m: expected three values on the last axis, got shape (4, 2)"),
+        ("index", 0.5, "points_m: expected three values on the last axis, got shape ()"),
+        ("index", [0.0, math.nan, 0.0], "points_m: expected finite numbers"),
+        ("index", [0.0, math.inf, 0.0], "points_m: expected finite numbers"),
+        ("index", [0.0, 1.7e308, 0.0], "points_m: expected finite numbers"),
+        ("index", None, "points_m: expected numbers, got None"),
+        ("contains", [[0, 0]], "indices: expected three values on the last axis, got shape (1, 2)"),
+        ("centres", ["a"], "indices: expected numbers, got ['a']"),
+        ("keys", [0, 0, 0], "indices: expected shape (N, 3), got (3,)"),
+        ("keys", np.zeros((3, 2), np.int16), "indices: expected three values on the last axis, got shape (3, 2)"),
+        ("keys", [[0.9, 0, 0]], "indices: expected integers, got [[0.9, 0, 0]]"),
+        ("keys", [[True, False, True]], "indices: expected integers"),
+        ("indices", ["a"], "keys: expected integers, got ['a']"),
+        ("indices", [1.9], "keys: expected integers, got [1.9]"),
+        ("indices", [[1], [2, 3]], "keys: expected integers, got [[1], [2, 3]]"),
+    ],
+)
+def test_what_is_no_place_is_one_clear_error(call: str, value: Any, message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        getattr(Lattice((0, 0, 0), 0.1, (2, 3, 4)), call)(value)
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)
 
 
 def test_equal_lattices_are_equal() -> None:

@@ -330,7 +330,7 @@ def _pipeline(
     settled: Path,
 ) -> Iterator[Finding]:
     """Kernels and what a frame costs, with the frames that were measured and a robot that stands elsewhere in each."""
-    from edge_unit.kernels.foreground import foreground_mask
+    from edge_unit.kernels.points import count_foreground
     from edge_unit.pipeline import DepthPipeline
 
     if not measured.depth:
@@ -350,7 +350,7 @@ def _pipeline(
         costs_ms.append((monotonic_ns() - started_ns) / NS_PER_MS)
         if number == 0:
             compiled_s = (monotonic_ns() - began_ns) / NS_PER_S
-    findings = [_kernels(settled, compiled_s, compiled=bool(cast(Any, foreground_mask).stats.cache_misses))]
+    findings = [_kernels(settled, compiled_s, compiled=bool(cast(Any, count_foreground).stats.cache_misses))]
     cost_ms, worst_ms = float(np.median(costs_ms[1:])), max(costs_ms[1:])
     text = f"{cost_ms:.1f} ms a frame (worst {worst_ms:.1f}) in {what}"
     budget_ms = 1000.0 / wanted_fps if wanted_fps else 1000.0 / max(measured.fps, 1.0)

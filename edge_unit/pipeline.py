@@ -27,23 +27,19 @@ from shared.transforms import Transform, inverse, validated
 EDGE_RADIUS_WIDTH_PX = 1280
 """`edge_radius_px` is given for this width; an edge's blur covers the same angle at every resolution."""
 
-MASK_ALIGNMENT = 8
-"""Rows of the mask are padded to whole words, so that eight empty pixels are skipped at once."""
-
 
 @dataclass(frozen=True)
 class StageTimes:
     """Nanoseconds that the stages of the last frame took."""
 
     expected_ns: int
-    filter_ns: int
-    voxelize_ns: int
-    density_ns: int
+    points_ns: int
+    voxels_ns: int
 
     @property
     def total_ns(self) -> int:
         """All stages together."""
-        return self.expected_ns + self.filter_ns + self.voxelize_ns + self.density_ns
+        return self.expected_ns + self.points_ns + self.voxels_ns
 
 
 class DepthPipeline:
@@ -75,9 +71,7 @@ class DepthPipeline:
         self.settings = settings or FilterSettings()
         self.T_world_camera = validated(T_world_camera, "T_world_camera")
         self.reference: Reference | None = None
-        self.last = StageTimes(0, 0, 0, 0)
-        stride = -(-intrinsics.width // MASK_ALIGNMENT) * MASK_ALIGNMENT
-        self._mask = np.zeros((intrinsics.height, stride), np.uint8)
+        self.last = StageTimes(0, 0, 0)
         self._limit_raw = np.empty(intrinsics.shape, np.uint16)
         self._seen_limit_raw = np.empty(intrinsics.shape, np.uint16)
         self._room_raw = np.empty(intrinsics.shape, np.uint16)
@@ -108,13 +102,12 @@ class DepthPipeline:
         started = stage_ns()
         self._place_robot(joints, joint_uncertainty_rad)
         expected = stage_ns()
-        self._filter(depth_raw)
-        filtered = stage_ns()
-        found = self._voxelizer.count(depth_raw, self._mask)
+        found = self._voxelizer.count(depth_raw, self._room_raw, self._minimum_raw, self._robot, self._halo)
         counted = stage_ns()
         voxels = self._voxelizer.keep_dense(found)
         finished = stage_ns()
-        self.last = StageTimes(expected - started, filtered - expected, counted - filtered, finished - counted)
+        self._depth_raw = depth_raw
+        self.last = StageTimes(expected - started, counted - expected, finished - counted)
         return voxels
 
     def foreground(
@@ -123,8 +116,9 @@ class DepthPipeline:
         """The pixels (H, W) that survive the filter; arguments and errors as in `process`."""
         depth_raw = self.intrinsics.check_depth(depth)
         self._place_robot(joints, joint_uncertainty_rad)
-        self._filter(depth_raw)
-        return self._mask[:, : self.intrinsics.width].astype(np.bool_)
+        mask = np.empty(self.intrinsics.shape, np.uint8)
+        self._filter(depth_raw, mask)
+        return mask.view(np.bool_)
 
     def expected_depth(
         self, joints: ArrayLike | None, *, joint_uncertainty_rad: ArrayLike = 0.0
@@ -275,8 +269,8 @@ class DepthPipeline:
             hidden,
         )
 
-    def _filter(self, depth_raw: NDArray[np.uint16]) -> None:
-        """Mark what is nearer than all that stands still, and not robot."""
+    def _filter(self, depth_raw: NDArray[np.uint16], mask: NDArray[np.uint8]) -> None:
+        """Mark with 1, else 0, what is nearer than all that stands still, and not robot."""
         self._depth_raw = depth_raw
         foreground.foreground_mask(
             depth_raw,
@@ -285,9 +279,9 @@ class DepthPipeline:
             self._robot.span_raw,
             self._robot.columns,
             self._minimum_raw,
-            self._mask,
+            mask,
         )
-        self._halo.drop(depth_raw, self._mask)
+        self._halo.drop(depth_raw, mask)
 
     def _forget_frame(self) -> None:
         """The last frame showed another place, or was filtered by other rules: until the next, nothing is seen."""

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_unit.kernels import density, voxelize
+from edge_unit.expected_depth import RobotLayer
+from edge_unit.halo import EdgeHalo
+from edge_unit.kernels import density, points, voxelize
 from shared.camera import Intrinsics
 from shared.lattice import Lattice
 from shared.settings import FilterSettings
@@ -48,13 +50,16 @@ class Voxelizer:
         self.lattice = lattice
         self._intrinsics = intrinsics
         self._settings = settings
-        points_max = min(intrinsics.width * intrinsics.height, lattice.cell_count)
+        most = min(intrinsics.width * intrinsics.height, lattice.cell_count)
         self._shape = np.array(lattice.shape, np.int32)
         self._counts = np.zeros(int(np.prod(self._shape + 2, dtype=np.int64)) + 1, np.uint32)
+        stride = -(-intrinsics.width // voxelize.PIXELS_PER_WORD) * voxelize.PIXELS_PER_WORD
+        # Behind the picture's last column it stays zero.
+        self._mask = np.zeros((points.ROWS_AT_ONCE, stride), np.uint8)
         self._slots = np.empty(intrinsics.width, np.int32)
-        self._touched = np.empty(points_max + 1, np.uint32)
-        self._kept = np.empty(points_max + 1, np.uint32)
-        self._kept_counts = np.empty(points_max + 1, np.uint32)
+        self._touched = np.empty(most + 1, np.uint32)
+        self._kept = np.empty(most + 1, np.uint32)
+        self._kept_counts = np.empty(most + 1, np.uint32)
         self._scratch = np.empty((6, density.AT_ONCE))
         self._keys = np.empty(density.AT_ONCE, np.uint32)
         self.place(T_world_camera)
@@ -75,19 +80,34 @@ class Voxelizer:
         self._degrees_per_column = math.degrees(2.0 * math.atan(camera.width / (2.0 * camera.fx))) / camera.width
         self._degrees_per_row = math.degrees(2.0 * math.atan(camera.height / (2.0 * camera.fy))) / camera.height
 
-    def count(self, depth_raw: NDArray[np.uint16], mask: NDArray[np.uint8]) -> int:
-        """Count the marked pixels of `depth_raw` (H, W); returns how many voxels hold any.
+    def count(
+        self,
+        depth_raw: NDArray[np.uint16],
+        room_raw: NDArray[np.uint16],
+        minimum_raw: int,
+        robot: RobotLayer,
+        halo: EdgeHalo,
+    ) -> int:
+        """Count the foreground of `depth_raw` (H, W); returns how many voxels hold any. `keep_dense` must follow.
 
-        `mask` (H, stride) with a stride that is a multiple of 8. `keep_dense` must follow.
+        `room_raw` (H, W) and `minimum_raw` as in `foreground.foreground_mask`.
         """
-        return voxelize.count_points(
+        return points.count_foreground(
             depth_raw,
-            mask.view(np.uint64),
-            mask,
+            room_raw,
+            robot.near_raw,
+            robot.span_raw,
+            robot.columns,
+            minimum_raw,
+            halo.runs,
+            halo.near_raw,
+            halo.span_raw,
             self._column_rays,
             self._row_rays,
             self._origin,
             self._shape,
+            self._mask.view(np.uint64),
+            self._mask,
             self._slots,
             self._counts,
             self._touched,

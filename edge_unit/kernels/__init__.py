@@ -12,6 +12,7 @@ In the order of the flow:
     reference   surfaces that the empty cell shows, learned pixel by pixel
     foreground  the pixels that nothing known explains
     voxelize    foreground pixels counted on the lattice (Algorithm 1)
+    points      from the image to the counter in one sweep, a few rows at a time
     density     voxels with too few points are noise (Algorithms 6 and 7)
     seen        which blocks of the cell a frame looks through
     agreement   how well measured depth fits expected depth

@@ -117,6 +117,7 @@ def drop_run(
 @kernel
 def drop_halo(
     depth_raw: NDArray[np.uint16],
+    top: int,
     runs: NDArray[np.int32],
     near_raw: NDArray[np.uint16],
     span_raw: NDArray[np.uint16],
@@ -124,10 +125,11 @@ def drop_halo(
 ) -> None:
     """Take the pixels of `depth_raw` (H, W) that lie in their halo's band out of `mask` (H, at least W).
 
-    The pixels that have one come in `runs` (R, 4) of neighbours in a row: the row, the first column, and the first of
-    the run's bands in `near_raw` and `span_raw` (N,) and the one after its last.
+    Row 0 of both is row `top` of the picture. The pixels that have a halo come in `runs` (R, 4) of neighbours in a row:
+    the row, the first column, and the first of the run's bands in `near_raw` and `span_raw` (N,) and the one after its
+    last.
     """
     for i in range(len(runs)):
         y, first, start, end = runs[i]
         last = first + end - start
-        drop_run(depth_raw[y, first:last], near_raw[start:end], span_raw[start:end], mask[y, first:last])
+        drop_run(depth_raw[y - top, first:last], near_raw[start:end], span_raw[start:end], mask[y - top, first:last])

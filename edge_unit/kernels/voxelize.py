@@ -104,14 +104,16 @@ def count_points(
     slots: NDArray[np.int32],
     counts: NDArray[np.uint32],
     touched: NDArray[np.uint32],
+    found: int,
 ) -> int:
-    """Deproject the marked pixels onto the lattice and count them; returns how many voxels were touched.
+    """Deproject the marked pixels onto the lattice and count them; returns how many voxels were touched until now.
 
     In units of voxels, with the camera's pose folded in: a pixel at column u, row v and raw depth d lies
     at `(column_rays[:, u] + row_rays[v]) * d + origin`; `column_rays` (3, W), `row_rays` (H, 3), `origin` (3,).
-    `mask` (H, stride) is also handed in as `mask_words` (H, stride / 8). `slots` (W,) is scratch.
-    `counts` has `(nx + 2) * (ny + 2) * (nz + 2) + 1` slots and is zero before the call; slots that became non-zero are
-    listed in `touched` (one longer than the most that may be), by which `forget` makes them zero again.
+    `mask` (at least H, stride) is also handed in as `mask_words` (., stride / 8). `slots` (W,) is scratch.
+    `counts` has `(nx + 2) * (ny + 2) * (nz + 2) + 1` slots and is zero before the first call; slots that become
+    non-zero are listed in `touched` (one longer than the most that may be) behind the `found` that are there, and by
+    it `forget` makes them zero again.
     """
     height, width = depth_raw.shape
     words = mask_words.shape[1]
@@ -121,7 +123,6 @@ def count_points(
     outside = np.int32(len(counts) - 1)
     # Never zero, so that it is never listed.
     counts[outside] = 1
-    found = 0
     for y in range(height):
         row = mask_words[y]
         word = next_marked(row, 0)

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from edge_unit.expected_depth import RobotLayer
+from edge_unit.halo import EdgeHalo
 from edge_unit.voxels import Voxelizer, Voxels
 from shared.camera import Intrinsics
 from shared.lattice import Lattice
@@ -18,14 +20,13 @@ DOUBT_M = 2e-5
 KEEP_ALL = FilterSettings(occupancy_threshold=0.05, own_share_min=0.0, support_area_max_m2=1e-4, support_points_min=0)
 
 
-def padded(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    out = np.zeros((mask.shape[0], -(-mask.shape[1] // 8) * 8), np.uint8)
-    out[:, : mask.shape[1]] = mask
-    return out
-
-
 def run(voxelizer: Voxelizer, depth: Depth, mask: NDArray[np.bool_]) -> Voxels:
-    return voxelizer.keep_dense(voxelizer.count(depth, padded(mask)))
+    """Nothing stands before the camera: all that is marked is foreground."""
+    intrinsics = camera(depth.shape[1], depth.shape[0])
+    room = np.where(mask, np.uint16(65535), np.uint16(0))
+    return voxelizer.keep_dense(
+        voxelizer.count(depth, room, 1, RobotLayer(intrinsics, None, 0.05), EdgeHalo(intrinsics))
+    )
 
 
 def points_m(intrinsics: Intrinsics, T_world_camera: Transform, depth: Depth) -> NDArray[np.float64]:

@@ -101,11 +101,8 @@ def test_only_what_lies_in_the_band_is_dropped() -> None:
     depth = np.array([[0, 900, 950, 1000, 1050, 1051, RAW_MAX, 1000]], np.uint16)
     mask = np.ones((1, 16), np.uint8)
     mask[0, 7] = 0
-    drop_halo(
-        depth,
-        np.array([[0, 0, 0, 3], [0, 3, 3, 7]], np.int32),
-        np.full(7, 950, np.uint16),
-        np.full(7, 100, np.uint16),
-        mask,
-    )
-    assert mask[0].tolist() == [1, 1, 0, 0, 0, 1, 1, 0] + [1] * 8
+    for top in (0, 40):
+        runs = np.array([[top, 0, 0, 3], [top, 3, 3, 7]], np.int32)
+        found = mask.copy()
+        drop_halo(depth, top, runs, np.full(7, 950, np.uint16), np.full(7, 100, np.uint16), found)
+        assert found[0].tolist() == [1, 1, 0, 0, 0, 1, 1, 0] + [1] * 8

@@ -49,6 +49,7 @@ class Counter:
             np.empty(width, np.int32),
             self.counts,
             self.touched,
+            0,
         )
         assert not self.guard.any()
         touched = self.touched[: self.found]

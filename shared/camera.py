@@ -91,10 +91,14 @@ class Intrinsics(BaseModel):
         """Return `depth` if it is a (height, width) uint16 image in C order.
 
         Raises:
-            InputError: it is not an array, or of another dtype or shape.
+            InputError: it is not an array, or masked, or of another dtype or shape.
         """
         if not isinstance(depth, np.ndarray):
             raise InputError(f"depth: expected a numpy array, got {type(depth).__name__}")
+        if isinstance(depth, np.ma.MaskedArray):
+            raise InputError(
+                "depth: expected a plain numpy array with 0 where nothing was measured, got a masked array"
+            )
         if depth.dtype != np.uint16:
             raise InputError(f"depth: expected dtype uint16 (units of depth_scale_m), got {depth.dtype}")
         if depth.shape != self.shape:

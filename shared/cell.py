@@ -130,6 +130,8 @@ class Cell:
             CellError: the file or one that it names is missing or wrong; one sentence that names the file,
                 the key and what came.
         """
+        if not isinstance(path, (str, Path)):
+            raise CellError(f"cell: expected the path of a cell file as text or Path, got {type(path).__name__}")
         file = Path(path)
         content = read_cell_file(file)
         try:

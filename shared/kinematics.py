@@ -104,8 +104,13 @@ class Robot:
         """Return `joints` as (n,) float64.
 
         Raises:
-            InputError: not as many finite numbers as the robot has joints.
+            InputError: not as many finite numbers as the robot has joints, or they are masked or booleans.
         """
+        if isinstance(joints, np.ma.MaskedArray):
+            raise InputError(f"joints: expected {self._expected()}, got a masked array")
+        items = joints if isinstance(joints, (list, tuple)) else ()
+        if getattr(joints, "dtype", None) == np.bool_ or any(isinstance(item, (bool, np.bool_)) for item in items):
+            raise InputError(f"joints: expected {self._expected()}, got booleans")
         try:
             positions = np.asarray(joints, dtype=np.float64)
         except (TypeError, ValueError) as error:

@@ -57,6 +57,13 @@ def test_demo_cell_is_whole(demo: Cell) -> None:
     np.testing.assert_array_equal(demo.robot.T_world_base, np.eye(4))
 
 
+@pytest.mark.parametrize("path", [None, 5, b"x"])
+def test_what_is_no_path_is_one_clear_error(path: Any) -> None:
+    with pytest.raises(CellError) as caught:
+        Cell.load(path)
+    assert str(caught.value) == f"cell: expected the path of a cell file as text or Path, got {type(path).__name__}"
+
+
 def world_bounds_m(body: PlacedMesh) -> list[list[float]]:
     points = apply(body.T_world_mesh, body.mesh.vertices)
     return [points.min(axis=0).tolist(), points.max(axis=0).tolist()]

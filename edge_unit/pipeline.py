@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +24,8 @@ from shared.errors import InputError
 from shared.lattice import Lattice
 from shared.settings import FilterSettings
 from shared.transforms import Transform, inverse, validated
+
+Kind = TypeVar("Kind")
 
 EDGE_RADIUS_WIDTH_PX = 1280
 """`edge_radius_px` is given for this width; an edge's blur covers the same angle at every resolution."""
@@ -64,11 +67,12 @@ class DepthPipeline:
             settings: defaults when left out.
 
         Raises:
-            InputError: the pose is no rigid transform, or the lattice would be too large.
+            InputError: an argument is of another type, the pose is no rigid transform, or the lattice would be too
+                large.
         """
-        self.intrinsics = intrinsics
-        self.cell = cell
-        self.settings = settings or FilterSettings()
+        self.intrinsics = _of_type(intrinsics, Intrinsics, "intrinsics")
+        self.cell = _of_type(cell, Cell, "cell")
+        self.settings = FilterSettings() if settings is None else _of_type(settings, FilterSettings, "settings")
         self.T_world_camera = validated(T_world_camera, "T_world_camera")
         self.reference: Reference | None = None
         self.last = StageTimes(0, 0, 0)
@@ -152,11 +156,15 @@ class DepthPipeline:
             frames: pairs of depth (H, W) uint16 and joints (n,).
 
         Raises:
-            InputError: there was no frame, or a frame of a cell with a robot came without joints.
+            InputError: there was no frame, one is no such pair, or one of a cell with a robot came without joints.
         """
         learner = self.learner()
-        for depth, joints in frames:
-            self.learn_frame(learner, depth, joints)
+        pairs: Iterable[object] = _of_type(frames, Iterable, "frames")
+        for pair in pairs:
+            if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+                came = f"{len(pair)} values" if isinstance(pair, (tuple, list)) else type(pair).__name__
+                raise InputError(f"frames: expected pairs of depth and joints, got {came}")
+            self.learn_frame(learner, *pair)
         return learner.reference()
 
     def learner(self) -> ReferenceLearner:
@@ -169,6 +177,7 @@ class DepthPipeline:
         The robot is left out by its own padded render, but for the links that never move: they belong to what stands
         still, and leaving them out would leave an unlearned ring around the base.
         """
+        _of_type(learner, ReferenceLearner, "learner")
         depth_raw = self.intrinsics.check_depth(depth)
         if self.cell.robot is not None and joints is None:
             raise InputError("learn: expected joints with every frame, for the robot must not be learned as background")
@@ -179,9 +188,9 @@ class DepthPipeline:
         """From now on `reference` is part of the static layer; None takes it out.
 
         Raises:
-            InputError: it was learned by a camera of another resolution.
+            InputError: it is no reference, or was learned by a camera of another resolution; the old one stays.
         """
-        if reference is not None and reference.depth_m.shape != self.intrinsics.shape:
+        if reference is not None and _of_type(reference, Reference, "reference").depth_m.shape != self.intrinsics.shape:
             raise InputError(
                 f"reference: expected images of {self.intrinsics.shape} (height, width), got {reference.depth_m.shape}"
             )
@@ -199,8 +208,9 @@ class DepthPipeline:
         """Work with other settings from now on.
 
         Raises:
-            InputError: the lattice would be too large; the old settings stay.
+            InputError: these are no settings, or the lattice would be too large; the old settings stay.
         """
+        _of_type(settings, FilterSettings, "settings")
         voxelizer = Voxelizer(self.intrinsics, self.T_world_camera, self.cell.lattice(settings.voxel_size_m), settings)
         visibility = self._look_from(self.T_world_camera, settings)
         if settings.robot_padding_m != self.settings.robot_padding_m:
@@ -228,7 +238,12 @@ class DepthPipeline:
         self._renew_static()
 
     def use_cell(self, cell: Cell) -> None:
-        """The cell is another from now on, or its known objects stand elsewhere."""
+        """The cell is another from now on, or its known objects stand elsewhere.
+
+        Raises:
+            InputError: it is no cell, or its lattice would be too large; the old one stays.
+        """
+        _of_type(cell, Cell, "cell")
         voxelizer = Voxelizer(
             self.intrinsics, self.T_world_camera, cell.lattice(self.settings.voxel_size_m), self.settings
         )
@@ -362,3 +377,10 @@ class DepthPipeline:
     def _noise_per_m(self) -> float:
         """The camera's noise `c` of `sigma(z) = c * z**2`, 1/m."""
         return self.intrinsics.disparity_noise_m(self.settings.stereo_subpixel_px)
+
+
+def _of_type(value: Kind, kind: type, name: str) -> Kind:
+    """Return `value` if it is a `kind`; where types are not checked, a wrong one must not fail half-way."""
+    if not isinstance(value, kind):
+        raise InputError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
+    return value

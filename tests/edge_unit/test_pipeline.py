@@ -440,6 +440,7 @@ BAD_DEPTH = [
     (GOOD.ravel(), r"depth: expected shape \(240, 424\)"),
     (GOOD.tolist(), "depth: expected a numpy array, got list"),
     (None, "depth: expected a numpy array, got NoneType"),
+    (np.ma.masked_equal(GOOD, 0), "depth: expected a plain numpy array .*, got a masked array"),
 ]
 BAD_JOINTS = [
     ([np.nan], "joints: expected .*nan"),
@@ -451,6 +452,9 @@ BAD_JOINTS = [
     (["a"], "joints: expected .*list"),
     ([None], "joints: expected"),
     ("no", "joints: expected .*str"),
+    (np.ma.masked_array([0.3], [True]), "joints: expected .*, got a masked array"),
+    (np.array([True]), "joints: expected .*, got booleans"),
+    ([True], "joints: expected .*, got booleans"),
 ]
 BAD_UNCERTAINTY = [
     (-0.1, "joint_uncertainty_rad: expected .*-0.1"),
@@ -516,6 +520,43 @@ def test_a_bad_pose_is_one_clear_error(working: DepthPipeline, pose: Any, messag
     with pytest.raises(InputError, match=message):
         DepthPipeline(CAMERA, pose, small_cell())
     assert (working.T_world_camera == OVERHEAD).all()
+    assert still_works(working)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("intrinsics", None, "intrinsics: expected Intrinsics, got NoneType"),
+        ("cell", None, "cell: expected Cell, got NoneType"),
+        ("settings", {}, "settings: expected FilterSettings, got dict"),
+        ("settings", {"range_max_m": 3.0}, "settings: expected FilterSettings, got dict"),
+    ],
+)
+def test_a_pipeline_of_other_things_is_one_clear_error(name: str, value: Any, message: str) -> None:
+    arguments = {"intrinsics": CAMERA, "T_world_camera": OVERHEAD, "cell": small_cell(), name: value}
+    with pytest.raises(InputError) as caught:
+        DepthPipeline(**arguments)
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("call", "value", "message"),
+    [
+        ("use", "x", "reference: expected Reference, got str"),
+        ("learn", [1], "frames: expected pairs of depth and joints, got int"),
+        ("learn", [(GOOD,)], "frames: expected pairs of depth and joints, got 1 values"),
+        ("learn", None, "frames: expected Iterable, got NoneType"),
+        ("apply", None, "settings: expected FilterSettings, got NoneType"),
+        ("apply", {}, "settings: expected FilterSettings, got dict"),
+        ("use_cell", None, "cell: expected Cell, got NoneType"),
+    ],
+)
+def test_other_things_are_one_clear_error_and_change_nothing(
+    working: DepthPipeline, call: str, value: Any, message: str
+) -> None:
+    with pytest.raises(InputError) as caught:
+        getattr(working, call)(value)
+    assert str(caught.value) == message
     assert still_works(working)
 
 

@@ -3,10 +3,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
+from pydantic_core import CoreSchema, core_schema
 
+from shared.configuration import sentence
 from shared.errors import InputError
 
 MAX_SIDE_PX = 4096
@@ -14,6 +18,17 @@ MAX_SIDE_PX = 4096
 
 D435_BASELINE_M = 0.050
 """Distance of the two infrared imagers of a RealSense D435/D435i (data sheet, 50 mm)."""
+
+
+def _complete(fields: object) -> object:
+    """A document with a field missing is refused here, for Python refuses to call `__init__` with it."""
+    if isinstance(fields, dict):
+        missing = [name for name in ("width", "height", "fx", "fy", "cx", "cy") if name not in fields]
+        if missing:
+            raise ValueError(f"expected {', '.join(missing)}, got none")
+        if not all(isinstance(name, str) for name in fields):
+            raise ValueError("expected text as names of fields, got another type")
+    return fields
 
 
 class Intrinsics(BaseModel):
@@ -49,18 +64,31 @@ class Intrinsics(BaseModel):
         fx_stereo: float | None = None,
         **unknown: object,
     ) -> None:
-        super().__init__(
-            width=width,
-            height=height,
-            fx=fx,
-            fy=fy,
-            cx=cx,
-            cy=cy,
-            depth_scale_m=depth_scale_m,
-            stereo_baseline_m=stereo_baseline_m,
-            fx_stereo=fx_stereo,
-            **unknown,
-        )
+        """Check all fields.
+
+        Raises:
+            InputError: one is out of range or unknown; the text names it. Inside a model, it is that model's fault.
+        """
+        try:
+            super().__init__(
+                width=width,
+                height=height,
+                fx=fx,
+                fy=fy,
+                cx=cx,
+                cy=cy,
+                depth_scale_m=depth_scale_m,
+                stereo_baseline_m=stereo_baseline_m,
+                fx_stereo=fx_stereo,
+                **unknown,
+            )
+        except ValidationError as error:
+            raise InputError(f"intrinsics: {sentence(error)}") from error
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Look at a document before it becomes arguments: pydantic's own hooks run only inside `__init__`."""
+        return core_schema.no_info_before_validator_function(_complete, handler(source))
 
     @property
     def shape(self) -> tuple[int, int]:

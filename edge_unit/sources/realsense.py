@@ -15,7 +15,7 @@ from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from edge_unit.sources import capture_link as link
 from edge_unit.sources.capture_session import CAPTURE_COMMAND
@@ -27,8 +27,7 @@ from edge_unit.sources.shared_frames import SharedFrame
 from edge_unit.sources.status import SourceStatus, StatusBoard
 from shared.camera import D435_BASELINE_M, Intrinsics
 from shared.clock import NS_PER_MS
-from shared.configuration import sentence
-from shared.errors import SourceError
+from shared.errors import InputError, SourceError
 
 SIZES = ((424, 240), (480, 270), (640, 480), (848, 480), (1280, 720))
 """Depth pictures that every camera of the D400 family offers; 848x480 is what its stereo was made for."""
@@ -259,8 +258,8 @@ def _intrinsics(opened: link.Opened, fx_stereo: float | None) -> Intrinsics:
             stereo_baseline_m=opened.stereo_baseline_m or D435_BASELINE_M,
             fx_stereo=fx_stereo,
         )
-    except ValidationError as error:
-        raise SourceError(f"camera {opened.serial}: {sentence(error)}") from error
+    except InputError as error:
+        raise SourceError(f"camera {opened.serial}: {error}") from error
 
 
 def _read_joints(path: Path) -> NDArray[np.float64]:

@@ -227,6 +227,8 @@ def _intrinsics(path: Path, config: RecordedSourceConfig) -> Intrinsics:
         )
     except ValidationError as error:
         raise SourceError(f"{path}: {sentence(error)}") from error
+    except InputError as error:
+        raise SourceError(f"{path}: {error}") from error
     except yaml.YAMLError as error:
         raise SourceError(f"{path}: no YAML: {' '.join(str(error).split())}") from error
     except (OSError, UnicodeDecodeError) as error:

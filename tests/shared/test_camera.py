@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from shared.camera import Intrinsics
 from shared.errors import InputError
@@ -85,6 +87,40 @@ def test_depth_images_are_checked() -> None:
 def test_impossible_cameras_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(ValidationError, match=next(iter(change))):
         Intrinsics.model_validate({**D435.model_dump(), **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"cx": float("nan")}, "intrinsics: cx: input should be a finite number, got nan"),
+        ({"width": 0}, "intrinsics: width: input should be greater than 0, got 0"),
+        (
+            {"fx": "wide"},
+            "intrinsics: fx: input should be a valid number, unable to parse string as a number, got 'wide'",
+        ),
+        ({"fy": None}, "intrinsics: fy: input should be a valid number, got None"),
+        ({"skew": 0.0}, "intrinsics: skew: extra inputs are not permitted, got 0.0"),
+    ],
+)
+def test_a_camera_of_wrong_numbers_is_one_clear_error(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Intrinsics(**(D435.model_dump() | change))
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("document", "words"),
+    [
+        ({"height": 1}, "expected width, fx, fy, cx, cy, got none"),
+        (dict[Any, Any](D435.model_dump()) | {1: 2}, "expected text as names"),
+        ({**D435.model_dump(), "fx": -1.0}, "intrinsics: fx: input should be greater than 0, got -1.0"),
+        (None, "instance of Intrinsics"),
+    ],
+)
+def test_a_wrong_camera_inside_a_model_is_the_fault_of_the_model(document: Any, words: str) -> None:
+    with pytest.raises(ValidationError, match=words) as caught:
+        TypeAdapter(dict[str, Intrinsics]).validate_python({"camera": document})
+    assert caught.value.errors()[0]["loc"][0] == "camera"
 
 
 def test_camera_travels_and_cannot_be_changed() -> None:

@@ -165,7 +165,7 @@ def break_it(folder: Path, how: str) -> None:
         ("info is text", "camera_info.yaml: no YAML"),
         ("info lacks", "camera_info.yaml: k: "),
         ("distorted", "camera_info.yaml: expected an image without distortion"),
-        ("focal length", "camera_info.yaml: fx: "),
+        ("focal length", "camera_info.yaml: intrinsics: fx: "),
         ("pose", "T_base_optical.txt: "),
         ("joints count", "joint_states_rad.csv: expected 12 rows, one for each depth image, got 1"),
         ("joints nan", "joint_states_rad.csv: expected finite"),

@@ -120,8 +120,9 @@ def passes(
         row = reach_raw[y]
         x = np.uint64(first_column)
         for _ in range(columns):
-            possible -= row[x] < far
-            blocked += np.uint16(row[x] - np.uint16(1)) < np.uint16(far - np.uint16(1))
+            possible -= int(row[x] < far)
+            # Between 1 and far, by one unsigned compare.
+            blocked += int(np.uint16(row[x] - np.uint16(1)) < np.uint16(far - np.uint16(1)))
             x += column_step
         # Most blocks are seen wholly or not at all.
         if possible < needed or blocked > BLOCKED_MAX:

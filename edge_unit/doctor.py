@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import importlib.metadata
 import platform
-import tempfile
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +21,7 @@ from edge_unit.board import clock_is_set, usb_cameras
 from edge_unit.cell_cache import mesh_hashes
 from edge_unit.client import MasterClient
 from edge_unit.config import UnitConfig
-from edge_unit.jit_cache import settle
+from edge_unit.jit_cache import PRIVATE, settle
 from edge_unit.sources import capture_link as link
 from edge_unit.sources.capture_session import CaptureSession
 from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
@@ -364,7 +363,7 @@ def _pipeline(
 
 def _kernels(settled: Path, ready_s: float, *, compiled: bool) -> Finding:
     where = f"in {settled}"
-    if settled.is_relative_to(tempfile.gettempdir()):
+    if any(part.startswith(PRIVATE) for part in settled.parts):
         return Finding(
             "warning", "kernels", f"compiled kernels are kept {where}, and lost at each boot; set CELLWATCH_JIT_CACHE"
         )

@@ -31,6 +31,9 @@ KERNELS = Path(__file__).parent / "kernels"
 STATES_MAX = 3
 """States of the kernels that are kept: this one, and what one may go back to."""
 
+PRIVATE = "cellwatch-jit-"
+"""Of a temporary folder, which is gone after the next boot."""
+
 PREFIX = "kernels-"
 """Of the folders' names; the rest is a digest of the source."""
 
@@ -112,11 +115,11 @@ def _writable(folder: Path) -> bool:
 def _private_folder() -> Path:
     """A folder that only this user can have filled, the same at each start where possible: kernels are code."""
     try:
-        folder = Path(tempfile.gettempdir()) / f"cellwatch-jit-{os.getuid()}"
+        folder = Path(tempfile.gettempdir()) / f"{PRIVATE}{os.getuid()}"
         folder.mkdir(mode=0o700, exist_ok=True)
         status = folder.lstat()
         if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077:
             return folder
-        return Path(tempfile.mkdtemp(prefix="cellwatch-jit-"))
+        return Path(tempfile.mkdtemp(prefix=PRIVATE))
     except OSError as error:
         raise JitCacheError(f"no folder for compiled kernels can be made, not even a temporary one: {error}") from error

@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps source-faults pictures test lint clean libusb
+.PHONY: help demo real sweeps source-faults bench-pipeline pictures test lint clean libusb
 
 ARGS ?=
 EXTRAS := edge,master,realsense,sim,dev
@@ -34,6 +34,9 @@ sweeps: $(READY) ## how thin, how small, how silent: the filter before simulated
 
 source-faults: $(READY) libusb ## a RealSense camera that hangs, dies and is unplugged: how long until frames flow again
 	@$(BIN)/python -m benchmarks.source_faults $(ARGS)
+
+bench-pipeline: $(BENCH_READY) libusb ## what a frame costs, beside Open3D, OctoMap and Embree on the same frames
+	@$(BIN)/python -m benchmarks.pipeline $(ARGS)
 
 pictures: $(READY) ## the pictures of the README, painted anew
 	@$(BIN)/python -m simulation.picture assets/pictures/demo.png

@@ -13,4 +13,7 @@ In the order of the flow:
     real_frames the real recordings, and what must come out of them
     real         a real master and a real unit on them, judged frame by frame
     source_faults what a RealSense source does when the camera makes trouble
+    ur3_scene    a UR3 in a room, something unknown beside it: what the speed is measured on
+    peers        the same work by Open3D, OctoMap and Embree
+    pipeline     what a frame costs, in turns with them
 """

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.inflation import vertex_offsets
-from edge_unit.kernels import rasterize
+from edge_unit.kernels import motion, rasterize
 from shared.camera import Intrinsics
 from shared.meshes import TriangleMesh
 
@@ -28,68 +28,88 @@ early: a robot that stops and goes by turns would have everything drawn twice.""
 
 
 class DepthBuffer:
-    """Nearest and farthest inverse depth, (H, more than W) float32 of 1/m; columns beyond the picture mean nothing."""
+    """Nearest and farthest inverse depth, 1/m, of a window of the picture, as `rasterize` has it."""
 
     def __init__(self, intrinsics: Intrinsics) -> None:
-        shape = (intrinsics.height, intrinsics.width + rasterize.LANES)
-        self.nearest_w = np.full(shape, rasterize.NOTHING_NEAREST, np.float32)
-        self.farthest_w = np.full(shape, rasterize.NOTHING_FARTHEST, np.float32)
+        size = intrinsics.height * (intrinsics.width + rasterize.LANES) + rasterize.LANES
+        self.nearest_w = np.zeros(size, np.float32)
+        self.farthest_w = np.zeros(size, np.float32)
+        self.window = np.zeros(4, np.int64)
+
+    def nearest_in(self, picture_w: NDArray[np.float32], rectangles: NDArray[np.int32]) -> None:
+        """Write what was drawn inside the `rectangles` (M, 4) into `picture_w` (H, W)."""
+        row, column, rows, stride = self.window.tolist()
+        window_w = self.nearest_w[: rows * stride].reshape(rows, stride)
+        for top, bottom, left, right in rectangles.tolist():
+            part = window_w[top - row : bottom + 1 - row, left - column : right + 1 - column]
+            picture_w[top : bottom + 1, left : right + 1] = part
 
 
 class MeshBatch:
     """Several meshes as the flat arrays that `rasterize.draw_meshes` takes, with scratch memory for them."""
 
-    def __init__(self, meshes: Sequence[TriangleMesh], inflate: bool) -> None:
+    def __init__(self, intrinsics: Intrinsics, meshes: Sequence[TriangleMesh], inflate: bool) -> None:
         """`inflate` prepares the offsets by which meshes grow; without it they are drawn as they are."""
         self.count = len(meshes)
-        vertices = [mesh.vertices for mesh in meshes]
-        offsets = [vertex_offsets(mesh) if inflate else np.zeros_like(mesh.vertices) for mesh in meshes]
-        self.vertices_m = _columns(vertices, np.float32)
-        self.offsets = _columns(offsets, np.float32)
-        self.faces = _columns([mesh.faces for mesh in meshes], np.int32)
-        self.vertex_starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)]).astype(np.int32)
-        self.face_starts = np.cumsum([0, *(len(mesh.faces) for mesh in meshes)]).astype(np.int32)
-        self.closed = np.array([mesh.closed for mesh in meshes], dtype=np.bool_)
         self.all = np.ones(self.count, np.bool_)
-        self.rectangles = np.tile(np.array([0, -1, 0, -1], np.int32), (self.count, 1))
-        vertices_max = max((len(mesh.vertices) for mesh in meshes), default=1)
+        self.rectangles = np.tile(np.array([intrinsics.height, -1, intrinsics.width, -1], np.int32), (self.count, 1))
+        self._intrinsics = intrinsics
+        self._camera = np.array(
+            (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, NEAR_PLANE_M), np.float32
+        )  # fmt: skip
+        offsets = [vertex_offsets(mesh) if inflate else np.zeros_like(mesh.vertices) for mesh in meshes]
+        self._vertices_m = _columns([mesh.vertices for mesh in meshes], np.float32)
+        self._offsets = _columns(offsets, np.float32)
+        self._faces = _columns([mesh.faces for mesh in meshes], np.int32)
+        self._vertex_starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)]).astype(np.int32)
+        self._face_starts = np.cumsum([0, *(len(mesh.faces) for mesh in meshes)]).astype(np.int32)
+        self._closed = np.array([mesh.closed for mesh in meshes], np.bool_)
         faces_max = max((len(mesh.faces) for mesh in meshes), default=1)
-        self._placed = np.empty((6, vertices_max), np.float32)
+        self._placed = np.empty((6, self._vertices_m.shape[1]), np.float32)
+        self._before = np.zeros(self.count, np.int32)
         self._kinds = np.empty(faces_max, np.uint8)
         self._lists = np.empty((3, faces_max + 1), np.int32)
         self._corners = np.empty((3, 3), np.float32)
         self._polygon = np.empty((4, 3), np.float64)
 
-    def draw(
+    def draw(self, T_camera_mesh: NDArray[np.float64], padding_m: NDArray[np.float32], buffer: DepthBuffer) -> None:
+        """Draw all meshes at poses (M, 4, 4), each grown by its padding (M,), into `buffer`."""
+        self.draw_over(buffer, ~self.all, T_camera_mesh, padding_m, buffer, self.all)
+
+    def draw_over(
         self,
-        intrinsics: Intrinsics,
+        kept: DepthBuffer,
+        others: NDArray[np.bool_],
         T_camera_mesh: NDArray[np.float64],
         padding_m: NDArray[np.float32],
         buffer: DepthBuffer,
-        chosen: NDArray[np.bool_] | None = None,
+        chosen: NDArray[np.bool_],
     ) -> None:
-        """Draw meshes at poses (M, 4, 4), each grown by its padding (M,); all of them, or the `chosen` (M,)."""
+        """Draw the `chosen` (M,) of the meshes over what is `kept` of the `others` (M,)."""
         rasterize.draw_meshes(
-            self.vertices_m,
-            self.offsets,
-            self.faces,
-            self.vertex_starts,
-            self.face_starts,
-            self.closed,
-            self.all if chosen is None else chosen,
-            np.ascontiguousarray(T_camera_mesh[:, :3, :], dtype=np.float32),
+            self._vertices_m,
+            self._offsets,
+            self._faces,
+            self._vertex_starts,
+            self._face_starts,
+            self._closed,
+            chosen,
+            others,
+            T_camera_mesh,
             padding_m,
-            np.float32(intrinsics.fx),
-            np.float32(intrinsics.fy),
-            np.float32(intrinsics.cx),
-            np.float32(intrinsics.cy),
-            np.float32(NEAR_PLANE_M),
-            intrinsics.width,
+            self._camera,
+            self._intrinsics.width,
+            self._intrinsics.height,
             self._placed,
+            self._before,
             self._kinds,
             self._lists,
             self._corners,
             self._polygon,
+            kept.window,
+            kept.nearest_w,
+            kept.farthest_w,
+            buffer.window,
             buffer.nearest_w,
             buffer.farthest_w,
             self.rectangles,
@@ -99,20 +119,20 @@ class MeshBatch:
 class LinkDrawing:
     """A robot's links on the screen, of which only those are drawn again that moved.
 
-    `buffer` holds the drawing once, until `draw` is called again: whoever reads it puts back what `kept` holds, in the
-    same pass, while it is hot in the cache.
+    Attributes:
+        buffer: what was drawn last.
     """
 
     def __init__(self, intrinsics: Intrinsics, meshes: Sequence[TriangleMesh], inflate: bool) -> None:
-        self._intrinsics = intrinsics
-        self._batch = MeshBatch(meshes, inflate)
+        self._batch = MeshBatch(intrinsics, meshes, inflate)
         self._reach_m = np.array([float(np.linalg.norm(mesh.vertices, axis=1).max()) for mesh in meshes])
         self.buffer = DepthBuffer(intrinsics)
-        self.kept = DepthBuffer(intrinsics)
+        self._kept = DepthBuffer(intrinsics)
         self._is_kept = np.zeros(self._batch.count, np.bool_)
+        self._is_drawn = np.zeros(self._batch.count, np.bool_)
         self._still_for = np.zeros(self._batch.count, np.int64)
-        # Nowhere yet: whatever comes has moved.
-        self._poses = np.full((self._batch.count, 4, 4), np.inf)
+        # Nowhere yet.
+        self._poses = np.full((self._batch.count, 4, 4), np.nan)
         self._padding_m = np.zeros(self._batch.count, np.float32)
 
     @property
@@ -120,46 +140,36 @@ class LinkDrawing:
         """First and last row, first and last column (L, 4) that each link may have touched."""
         return self._batch.rectangles
 
+    @property
+    def all(self) -> NDArray[np.bool_]:
+        """All links (L,)."""
+        return self._batch.all
+
     def draw(self, T_camera_link: NDArray[np.float64], padding_m: NDArray[np.float32], anew: bool = True) -> bool:
         """Draw the links at poses (L, 4, 4), each grown by its padding (L,) m.
 
         Unless it must be `anew`, nothing is drawn and False returned when no vertex has moved by more than STILL_M.
         """
-        moved = self._moved(T_camera_link, padding_m)
-        if not anew and not moved.any():
+        found = motion.settle(
+            T_camera_link,
+            padding_m,
+            self._reach_m,
+            STILL_M,
+            KEPT_AFTER,
+            anew,
+            self._poses,
+            self._padding_m,
+            self._still_for,
+            self._is_kept,
+            self._is_drawn,
+        )
+        if found == motion.STILL:
             return False
-        self._still_for[moved] = 0
-        self._still_for[~moved] += 1
-        still = self._still_for >= KEPT_AFTER
-        if (self._is_kept & moved).any() or (still & ~self._is_kept).any():
-            self._keep(still, T_camera_link, padding_m)
-        drawn = ~self._is_kept
-        self._batch.draw(self._intrinsics, T_camera_link, padding_m, self.buffer, drawn)
-        self._poses[drawn] = T_camera_link[drawn]
-        self._padding_m[drawn] = padding_m[drawn]
+        batch, kept = self._batch, self._kept
+        if found == motion.KEPT_CHANGES:
+            batch.draw_over(kept, ~batch.all, T_camera_link, padding_m, kept, self._is_kept)
+        batch.draw_over(kept, self._is_kept, T_camera_link, padding_m, self.buffer, self._is_drawn)
         return True
-
-    def _keep(
-        self, still: NDArray[np.bool_], T_camera_link: NDArray[np.float64], padding_m: NDArray[np.float32]
-    ) -> None:
-        """Have the links that are `still` (L,), and no others, in the drawing that is kept aside."""
-        batch, kept, buffer = self._batch, self.kept, self.buffer
-        rectangles = batch.rectangles
-        rasterize.clear_rectangles(rectangles, self._is_kept, kept.nearest_w, kept.farthest_w)
-        rasterize.clear_rectangles(rectangles, self._is_kept, buffer.nearest_w, buffer.farthest_w)
-        batch.draw(self._intrinsics, T_camera_link, padding_m, kept, still)
-        rasterize.copy_rectangles(
-            rectangles, still, kept.nearest_w, kept.farthest_w, buffer.nearest_w, buffer.farthest_w
-        )  # fmt: skip
-        self._poses[still] = T_camera_link[still]
-        self._padding_m[still] = padding_m[still]
-        self._is_kept = still
-
-    def _moved(self, T_camera_link: NDArray[np.float64], padding_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Which links (L,) have a vertex that may have moved by more than STILL_M since it was drawn."""
-        change = np.abs(T_camera_link - self._poses)
-        moved_m = change[:, :3, 3].sum(axis=1) + change[:, :3, :3].sum(axis=(1, 2)) * self._reach_m
-        return np.asarray(moved_m + np.abs(padding_m - self._padding_m) > STILL_M)
 
 
 def _columns(parts: Sequence[NDArray[Number]], dtype: type[Number]) -> NDArray[Number]:

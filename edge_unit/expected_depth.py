@@ -30,16 +30,17 @@ class StaticLayer:
 
     def __init__(self, intrinsics: Intrinsics, meshes: Sequence[TriangleMesh]) -> None:
         self._intrinsics = intrinsics
-        self._batch = MeshBatch(meshes, inflate=False)
+        self._batch = MeshBatch(intrinsics, meshes, inflate=False)
         self.nearest_w = np.zeros(intrinsics.shape, np.float32)
 
     def draw(self, T_world_camera: Transform, T_world_mesh: Sequence[Transform]) -> None:
         """Draw all meshes anew at their poses."""
-        buffer = DepthBuffer(self._intrinsics)
+        self.nearest_w = np.zeros(self._intrinsics.shape, np.float32)
         if self._batch.count:
+            buffer = DepthBuffer(self._intrinsics)
             T_camera_mesh = inverse(T_world_camera) @ np.stack(T_world_mesh)
-            self._batch.draw(self._intrinsics, T_camera_mesh, np.zeros(self._batch.count, np.float32), buffer)
-        self.nearest_w = np.ascontiguousarray(buffer.nearest_w[:, : self._intrinsics.width])
+            self._batch.draw(T_camera_mesh, np.zeros(self._batch.count, np.float32), buffer)
+            buffer.nearest_in(self.nearest_w, self._batch.rectangles)
 
 
 class RobotLayer:
@@ -89,11 +90,11 @@ class RobotLayer:
         if not drawing.draw(T_camera_link, growth_m, anew=not self._is_shown):
             return False
         limits.robot_band_raw(
+            drawing.buffer.window,
             drawing.buffer.nearest_w,
             drawing.buffer.farthest_w,
-            drawing.kept.nearest_w,
-            drawing.kept.farthest_w,
             drawing.rectangles,
+            drawing.all,
             noise_per_m,
             depth_m,
             self._intrinsics.depth_scale_m,
@@ -117,11 +118,5 @@ class BareRobot:
         """Lower `depth_m` (H, W) to the links at poses (L, 4, 4) where they are nearer."""
         drawing = self._drawing
         drawing.draw(T_camera_link, self._no_padding_m)
-        limits.lower_depth(
-            drawing.buffer.nearest_w,
-            drawing.buffer.farthest_w,
-            drawing.kept.nearest_w,
-            drawing.kept.farthest_w,
-            drawing.rectangles,
-            depth_m,
-        )
+        buffer = drawing.buffer
+        limits.lower_depth(buffer.window, buffer.nearest_w, drawing.rectangles, drawing.all, depth_m)

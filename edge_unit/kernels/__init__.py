@@ -5,6 +5,8 @@ They import only numpy, numba, math and one another; each has a slow twin in pla
 In the order of the flow:
 
     jit         how kernels are compiled
+    motion      which links have moved since they were drawn
+    project     where meshes come to lie on the screen
     rasterize   meshes onto the screen: nearest and farthest inverse depth (Algorithms 2 to 4)
     hull        the surface at a distance from a mesh
     limits      expected depth less margins, as raw depth that a pixel is compared with

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.kernels.jit import kernel
+from edge_unit.kernels.rasterize import span_of_row
 
 RAW_MAX = 65535
 """The largest raw depth."""
@@ -84,22 +85,17 @@ def nearest_over(
 
 
 @kernel
-def span_of_row(y: int, rectangles: NDArray[np.int32]) -> tuple[int, int]:
-    """First column and the one after the last of all `rectangles` (M, 4) in row y; (0, 0) when none reaches it."""
-    first, end = 0, 0
-    for m in range(len(rectangles)):
-        if rectangles[m, 0] <= y <= rectangles[m, 1] and rectangles[m, 2] <= rectangles[m, 3]:
-            first = min(first, rectangles[m, 2]) if end > 0 else rectangles[m, 2]
-            end = max(end, rectangles[m, 3] + 1)
-    return first, end
+def empty_row(near_raw: NDArray[np.uint16], span_raw: NDArray[np.uint16], first: int, end: int) -> None:
+    """No band from column `first` to before `end`."""
+    if first < end:
+        near_raw[first:end] = np.uint16(RAW_MAX)
+        span_raw[first:end] = np.uint16(0)
 
 
 @kernel
 def band_of_row(
     nearest_w: NDArray[np.float32],
     farthest_w: NDArray[np.float32],
-    kept_nearest_w: NDArray[np.float32],
-    kept_farthest_w: NDArray[np.float32],
     noise_per_m: np.float32,
     depth_m: np.float32,
     units_per_m: np.float32,
@@ -117,17 +113,15 @@ def band_of_row(
         # Where nothing was drawn w is 0 and the above is nonsense.
         near_raw[i] = np.uint16(low) if w > ZERO else np.uint16(RAW_MAX)
         span_raw[i] = np.uint16(np.int32(far) - low) if w > ZERO else np.uint16(0)
-        nearest_w[i] = kept_nearest_w[i]
-        farthest_w[i] = kept_farthest_w[i]
 
 
 @kernel
 def robot_band_raw(
+    window: NDArray[np.int64],
     nearest_w: NDArray[np.float32],
     farthest_w: NDArray[np.float32],
-    kept_nearest_w: NDArray[np.float32],
-    kept_farthest_w: NDArray[np.float32],
     rectangles: NDArray[np.int32],
+    links: NDArray[np.bool_],
     noise_per_m: float,
     depth_m: float,
     depth_scale_m: float,
@@ -135,32 +129,27 @@ def robot_band_raw(
     span_raw: NDArray[np.uint16],
     columns: NDArray[np.int32],
 ) -> None:
-    """The band of raw depths in which a measurement belongs to the robot, whose links lie in `rectangles` (M, 4).
+    """The band of raw depths in which a measurement belongs to the robot, as `rasterize.draw_meshes` has drawn it.
 
     From the nearest padded surface less its noise margin to the farthest padded surface plus its margin plus
     `depth_m`: what stands behind the robot's silhouette is still seen. The band is stored as its lower end
     and its length, so that the filter needs one unsigned compare. Where there is no robot it is empty: its lower end
     is where no limit reaches. `columns` (H, 2) holds of each row the first column and the one after the last that the
     images `near_raw` and `span_raw` (H, W) have a band in; it is renewed, and what was there before is made empty.
-
-    The drawing, `nearest_w` and `farthest_w` (H, at least W) of 1/m, is taken in, and what is kept of it put back in
-    the same pass: it is hot in the cache only once.
     """
     noise = np.float32(noise_per_m)
     depth = np.float32(depth_m)
     units = np.float32(1.0 / depth_scale_m)
     for y in range(len(near_raw)):
-        first, end = span_of_row(y, rectangles)
-        if columns[y, 0] < columns[y, 1] and (columns[y, 0] < first or columns[y, 1] > end):
-            near_raw[y, columns[y, 0] : columns[y, 1]] = np.uint16(RAW_MAX)
-            span_raw[y, columns[y, 0] : columns[y, 1]] = np.uint16(0)
+        first, end = span_of_row(y, rectangles, links, links)
+        empty_row(near_raw[y], span_raw[y], columns[y, 0], min(columns[y, 1], first))
+        empty_row(near_raw[y], span_raw[y], max(columns[y, 0], end), columns[y, 1])
         columns[y, 0], columns[y, 1] = first, end
         if first < end:
+            at = (y - window[0]) * window[3] - window[1]
             band_of_row(
-                nearest_w[y, first:end],
-                farthest_w[y, first:end],
-                kept_nearest_w[y, first:end],
-                kept_farthest_w[y, first:end],
+                nearest_w[at + first : at + end],
+                farthest_w[at + first : at + end],
                 noise,
                 depth,
                 units,
@@ -173,45 +162,28 @@ def robot_band_raw(
 def clear_band(near_raw: NDArray[np.uint16], span_raw: NDArray[np.uint16], columns: NDArray[np.int32]) -> None:
     """Make the band of `robot_band_raw` empty everywhere."""
     for y in range(len(near_raw)):
-        near_raw[y, columns[y, 0] : columns[y, 1]] = np.uint16(RAW_MAX)
-        span_raw[y, columns[y, 0] : columns[y, 1]] = np.uint16(0)
+        empty_row(near_raw[y], span_raw[y], columns[y, 0], columns[y, 1])
         columns[y, 0], columns[y, 1] = 0, 0
 
 
 @kernel
-def lower_row(
-    nearest_w: NDArray[np.float32],
-    kept_nearest_w: NDArray[np.float32],
-    farthest_w: NDArray[np.float32],
-    kept_farthest_w: NDArray[np.float32],
-    depth_m: NDArray[np.float32],
-) -> None:
+def lower_row(nearest_w: NDArray[np.float32], depth_m: NDArray[np.float32]) -> None:
     """One stretch of a row of `lower_depth`; written for the vectoriser."""
     for i in range(len(nearest_w)):
-        z = ONE / nearest_w[i]
-        # Where nothing was drawn w is 0 and z infinite.
-        depth_m[i] = min(depth_m[i], z)
-        nearest_w[i] = kept_nearest_w[i]
-        farthest_w[i] = kept_farthest_w[i]
+        # Where nothing was drawn w is 0 and its inverse infinite.
+        depth_m[i] = min(depth_m[i], ONE / nearest_w[i])
 
 
 @kernel
 def lower_depth(
+    window: NDArray[np.int64],
     nearest_w: NDArray[np.float32],
-    farthest_w: NDArray[np.float32],
-    kept_nearest_w: NDArray[np.float32],
-    kept_farthest_w: NDArray[np.float32],
     rectangles: NDArray[np.int32],
+    links: NDArray[np.bool_],
     depth_m: NDArray[np.float32],
 ) -> None:
-    """Lower `depth_m` (H, W) to the drawn surface where that is nearer; the drawing as in `robot_band_raw`."""
-    for y in range(len(depth_m)):
-        first, end = span_of_row(y, rectangles)
-        if first < end:
-            lower_row(
-                nearest_w[y, first:end],
-                kept_nearest_w[y, first:end],
-                farthest_w[y, first:end],
-                kept_farthest_w[y, first:end],
-                depth_m[y, first:end],
-            )
+    """Lower `depth_m` (H, W) to what `rasterize.draw_meshes` has drawn where that is nearer."""
+    for y in range(window[0], window[0] + window[2]):
+        first, end = span_of_row(y, rectangles, links, links)
+        at = (y - window[0]) * window[3] - window[1]
+        lower_row(nearest_w[at + first : at + end], depth_m[y, first:end])

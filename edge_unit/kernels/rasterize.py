@@ -4,8 +4,12 @@
 What is linear on the screen is 1/z, not z; so the buffers hold `w = 1/z` (1/m): the nearest surface
 has the largest w, and 0 means that nothing stands there. Pixel centres are at integer coordinates.
 
-Corners are rounded to `1 / SUBPIXELS` of a pixel. Small triangles, which are nearly all, are then drawn by edge
-functions in integers, which never round, `LANES` pixels of a row at once. Large ones go span by span in float64.
+A buffer holds only a *window* of the picture, the rectangle about all that is drawn: thirty times a second it comes
+from cold memory, where few pages in a row are fetched several times as fast as many scattered ones. Window (4,):
+first row, first column, rows, and columns with those that `LANES` may run over; a buffer is flat.
+
+Small triangles, which are nearly all, are drawn by edge functions in integers, which never round, `LANES` pixels of a
+row at once. Large ones go span by span in float64.
 """
 
 from __future__ import annotations
@@ -16,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.kernels.jit import kernel
+from edge_unit.kernels.project import SUBPIXELS, clip, corners_of, place_meshes
 
 NOTHING_NEAREST = np.float32(0.0)
 """`nearest_w` of a pixel without a surface: infinitely far."""
@@ -28,11 +33,6 @@ LANES = 16
 """Pixels of a row that are drawn at once, whether they are needed or not; buffers are so much wider than the picture.
 With fewer the compiler unrolls the loop before it could vectorise it."""
 
-SUBPIXELS = np.float32(512.0)
-"""Corners are off by a thousandth of a pixel at most; a depth camera cannot tell half a pixel."""
-
-SUBPIXEL = np.float32(1.0 / 512.0)
-
 SMALL_ROWS = 96
 """Triangles up to twice `LANES` wide and so many rows high are drawn with integers of 32 bits. An edge's function is
 the difference of two products, at most (32 + 16) * 96 + 32 * 96 pixels in units of 1/512 squared: 2.01e9 of 2.15e9."""
@@ -40,56 +40,6 @@ the difference of two products, at most (32 + 16) * 96 + 32 * 96 pixels in units
 UNSEEN, SMALL, WIDE, LARGE = 0, 1, 2, 3
 """What is done with a triangle: nothing, for it is turned away or holds no pixel centre; or how it is drawn: at once
 when no wider than `LANES`, in two halves when no wider than twice that, or span by span."""
-
-
-@kernel
-def place_vertices(
-    x_m: NDArray[np.float32],
-    y_m: NDArray[np.float32],
-    z_m: NDArray[np.float32],
-    offset_x: NDArray[np.float32],
-    offset_y: NDArray[np.float32],
-    offset_z: NDArray[np.float32],
-    padding_m: np.float32,
-    T_camera_mesh: NDArray[np.float32],
-    fx: np.float32,
-    fy: np.float32,
-    cx: np.float32,
-    cy: np.float32,
-    near_m: np.float32,
-    u_px: NDArray[np.float32],
-    v_px: NDArray[np.float32],
-    w_per_m: NDArray[np.float32],
-    camera_x_m: NDArray[np.float32],
-    camera_y_m: NDArray[np.float32],
-    camera_z_m: NDArray[np.float32],
-) -> int:
-    """Vertices to the camera frame and to the screen; returns how many lie before the near plane.
-
-    Written for the vectoriser: one type, no branch, each coordinate in its own array.
-    """
-    t = T_camera_mesh
-    xx, xy, xz, x0 = t[0, 0], t[0, 1], t[0, 2], t[0, 3]
-    yx, yy, yz, y0 = t[1, 0], t[1, 1], t[1, 2], t[1, 3]
-    zx, zy, zz, z0 = t[2, 0], t[2, 1], t[2, 2], t[2, 3]
-    one = np.float32(1.0)
-    before = 0
-    for i in range(len(x_m)):
-        px = x_m[i] + padding_m * offset_x[i]
-        py = y_m[i] + padding_m * offset_y[i]
-        pz = z_m[i] + padding_m * offset_z[i]
-        x = xx * px + xy * py + xz * pz + x0
-        y = yx * px + yy * py + yz * pz + y0
-        z = zx * px + zy * py + zz * pz + z0
-        w = one / max(z, near_m)
-        u_px[i] = np.rint((x * w * fx + cx) * SUBPIXELS) * SUBPIXEL
-        v_px[i] = np.rint((y * w * fy + cy) * SUBPIXELS) * SUBPIXEL
-        w_per_m[i] = w
-        camera_x_m[i] = x
-        camera_y_m[i] = y
-        camera_z_m[i] = z
-        before += z < near_m
-    return before
 
 
 @kernel
@@ -178,21 +128,19 @@ def fill_small(
     w_per_m: NDArray[np.float32],
     width: int,
     height: int,
-    stride: int,
+    window: NDArray[np.int64],
     nearest_w: NDArray[np.float32],
     farthest_w: NDArray[np.float32],
-    rectangle: NDArray[np.int32],
 ) -> None:
     """Draw `LANES` columns, from each one's column `from_column` on, of the triangles whose numbers are `faces`.
 
     A pixel is drawn when its centre is on the inner side of all three edges, or on one: neighbours leave no gap, for
-    integers do not round. `nearest_w` and `farthest_w` are flat, `stride` to a row. `rectangle` (4,) as in
-    `draw_meshes`.
+    integers do not round.
     """
     zero = np.float32(0.0)
     last_column, last_row = np.float32(width - 1), np.float32(height - 1)
     pixel = np.int32(SUBPIXELS)
-    first_row, end_row, first_column, end_column = rectangle[0], rectangle[1], rectangle[2], rectangle[3]
+    first_row, first_column, stride = window[0], window[1], window[3]
     for n in range(len(faces)):
         f = np.uint32(faces[n])
         i, j, k = np.uint32(a[f]), np.uint32(b[f]), np.uint32(c[f])
@@ -226,7 +174,7 @@ def fill_small(
         # A sliver's gradient is ill-conditioned: never leave the range of its corners.
         w_low, w_high = min(w0, min(w1, w2)), max(w0, max(w1, w2))
         w = w0 + (u_left - u0) * w_per_u + (v_top - v0) * w_per_v
-        at = np.uint64(top * stride + left)
+        at = np.uint64((top - first_row) * stride + left - first_column)
         for _ in range(bottom - top + 1):
             # Two loops, each with one array: with two in one, the vectoriser would have to ask whether they overlap.
             for lane in range(LANES):
@@ -248,9 +196,6 @@ def fill_small(
             edge_0, edge_1, edge_2 = np.int32(edge_0 + per_y_0), np.int32(edge_1 + per_y_1), np.int32(edge_2 + per_y_2)
             w += w_per_v
             at += np.uint64(stride)
-        first_row, end_row = min(first_row, top), max(end_row, bottom)
-        first_column, end_column = min(first_column, left), max(end_column, right)
-    rectangle[0], rectangle[1], rectangle[2], rectangle[3] = first_row, end_row, first_column, end_column
 
 
 @kernel
@@ -265,17 +210,16 @@ def fill_triangle(
     v2: float,
     w2: float,
     width: int,
+    height: int,
+    window: NDArray[np.int64],
     nearest_w: NDArray[np.float32],
     farthest_w: NDArray[np.float32],
-    rectangle: NDArray[np.int32],
 ) -> None:
     """Draw one triangle of any size, given by pixel coordinates and inverse depth of its corners.
 
     Every pixel centre on or inside an edge is drawn, and the crossing of an edge with a row is reckoned from its
-    upper end whichever triangle it belongs to: neighbours leave no gap. `rectangle` (4,) grows: first and
-    last row, first and last column that may have been touched.
+    upper end whichever triangle it belongs to: neighbours leave no gap.
     """
-    height = len(nearest_w)
     left = max(math.ceil(min(u0, u1, u2)), 0)
     right = min(math.floor(max(u0, u1, u2)), width - 1)
     top = max(math.ceil(min(v0, v1, v2)), 0)
@@ -310,18 +254,15 @@ def fill_triangle(
         w = min(max(np.float32(w_row + (first - u0) * w_per_u), w_low), w_high)
         w_last = min(max(np.float32(w_row + (last - u0) * w_per_u), w_low), w_high)
         step = (w_last - w) / np.float32(max(last - first, 1))
-        nearest_row = nearest_w[y, first : last + 1]
+        at = (y - window[0]) * window[3] + first - window[1]
+        nearest_row = nearest_w[at : at + last + 1 - first]
         for x in range(len(nearest_row)):
             here = w + np.float32(x) * step
             nearest_row[x] = here if here > nearest_row[x] else nearest_row[x]
-        farthest_row = farthest_w[y, first : last + 1]
+        farthest_row = farthest_w[at : at + last + 1 - first]
         for x in range(len(farthest_row)):
             here = w + np.float32(x) * step
             farthest_row[x] = here if here < farthest_row[x] else farthest_row[x]
-    rectangle[0] = min(rectangle[0], top)
-    rectangle[1] = max(rectangle[1], bottom)
-    rectangle[2] = min(rectangle[2], left)
-    rectangle[3] = max(rectangle[3], right)
 
 
 @kernel
@@ -329,43 +270,15 @@ def fill_clipped(
     corners: NDArray[np.float32],
     polygon: NDArray[np.float64],
     cull: bool,
-    fx: np.float32,
-    fy: np.float32,
-    cx: np.float32,
-    cy: np.float32,
-    near_m: np.float32,
+    camera: NDArray[np.float32],
     width: int,
+    height: int,
+    window: NDArray[np.int64],
     nearest_w: NDArray[np.float32],
     farthest_w: NDArray[np.float32],
-    rectangle: NDArray[np.int32],
 ) -> None:
-    """Draw the part beyond the near plane of a triangle with corners (3, 3) in the camera frame.
-
-    `polygon` (4, 3) is scratch: a triangle cut by a plane has up to four corners.
-    """
-    count = 0
-    for i in range(3):
-        j = (i + 1) % 3
-        z_i = corners[i, 2]
-        z_j = corners[j, 2]
-        if z_i >= near_m:
-            # Reckoned as `place_vertices` does: a neighbour that is not cut has the same corners.
-            w = np.float32(1.0) / z_i
-            polygon[count, 0] = np.rint((corners[i, 0] * w * fx + cx) * SUBPIXELS) * SUBPIXEL
-            polygon[count, 1] = np.rint((corners[i, 1] * w * fy + cy) * SUBPIXELS) * SUBPIXEL
-            polygon[count, 2] = w
-            count += 1
-        if (z_i >= near_m) != (z_j >= near_m):
-            # Always from the end in front, so that a neighbour that is cut too finds the same point.
-            front, back = (i, j) if z_i >= near_m else (j, i)
-            share = (near_m - corners[front, 2]) / (corners[back, 2] - corners[front, 2])
-            x = corners[front, 0] + share * (corners[back, 0] - corners[front, 0])
-            y = corners[front, 1] + share * (corners[back, 1] - corners[front, 1])
-            polygon[count, 0] = x / near_m * fx + cx
-            polygon[count, 1] = y / near_m * fy + cy
-            polygon[count, 2] = 1.0 / near_m
-            count += 1
-    for i in range(1, count - 1):
+    """Draw what lies beyond the near plane of a triangle with corners (3, 3) in the camera frame; `polygon` (4, 3)."""
+    for i in range(1, clip(corners, camera, polygon) - 1):
         u0, v0 = polygon[0, 0], polygon[0, 1]
         u1, v1 = polygon[i, 0], polygon[i, 1]
         u2, v2 = polygon[i + 1, 0], polygon[i + 1, 1]
@@ -375,68 +288,45 @@ def fill_clipped(
             u0, v0, polygon[0, 2],
             u1, v1, polygon[i, 2],
             u2, v2, polygon[i + 1, 2],
-            width, nearest_w, farthest_w, rectangle,
+            width, height, window, nearest_w, farthest_w,
         )  # fmt: skip
 
 
 @kernel
-def draw_mesh(
-    vertices_m: NDArray[np.float32],
-    offsets: NDArray[np.float32],
-    faces: NDArray[np.int32],
-    first_vertex: int,
-    end_vertex: int,
-    first_face: int,
-    end_face: int,
+def fill_mesh(
+    a: NDArray[np.int32],
+    b: NDArray[np.int32],
+    c: NDArray[np.int32],
     closed: bool,
-    T_camera_mesh: NDArray[np.float32],
-    padding_m: np.float32,
-    fx: np.float32,
-    fy: np.float32,
-    cx: np.float32,
-    cy: np.float32,
-    near_m: np.float32,
+    before: int,
+    u_px: NDArray[np.float32],
+    v_px: NDArray[np.float32],
+    w_per_m: NDArray[np.float32],
+    x_m: NDArray[np.float32],
+    y_m: NDArray[np.float32],
+    z_m: NDArray[np.float32],
+    camera: NDArray[np.float32],
     width: int,
-    placed: NDArray[np.float32],
+    height: int,
+    window: NDArray[np.int64],
     kinds: NDArray[np.uint8],
     lists: NDArray[np.int32],
     corners: NDArray[np.float32],
     polygon: NDArray[np.float64],
     nearest_w: NDArray[np.float32],
     farthest_w: NDArray[np.float32],
-    rectangle: NDArray[np.int32],
 ) -> None:
-    """Draw one of the meshes of `draw_meshes`."""
-    count = end_vertex - first_vertex
-    u_px, v_px, w_per_m = placed[0, :count], placed[1, :count], placed[2, :count]
-    x_m, y_m, z_m = placed[3, :count], placed[4, :count], placed[5, :count]
-    before = place_vertices(
-        vertices_m[0, first_vertex:end_vertex],
-        vertices_m[1, first_vertex:end_vertex],
-        vertices_m[2, first_vertex:end_vertex],
-        offsets[0, first_vertex:end_vertex],
-        offsets[1, first_vertex:end_vertex],
-        offsets[2, first_vertex:end_vertex],
-        padding_m, T_camera_mesh, fx, fy, cx, cy, near_m,
-        u_px, v_px, w_per_m, x_m, y_m, z_m,
-    )  # fmt: skip
-    if before == count:
-        return
-    height, stride = nearest_w.shape
-    a, b, c = faces[0, first_face:end_face], faces[1, first_face:end_face], faces[2, first_face:end_face]
-    kind = kinds[: len(a)]
-    sort_faces(a, b, c, u_px, v_px, closed, np.float32(width - 1), np.float32(height - 1), kind)
+    """Draw one of the meshes of `draw_meshes`, `before` of whose vertices lie before the near plane."""
+    near_m = camera[4]
+    sort_faces(a, b, c, u_px, v_px, closed, np.float32(width - 1), np.float32(height - 1), kinds)
     if before > 0:
-        sort_cut_faces(a, b, c, z_m, near_m, kind)
-    smalls, wides, larges = list_faces(kind, lists[0], lists[1], lists[2])
-    flat_nearest_w, flat_farthest_w = nearest_w.reshape(-1), farthest_w.reshape(-1)
+        sort_cut_faces(a, b, c, z_m, near_m, kinds)
+    smalls, wides, larges = list_faces(kinds, lists[0], lists[1], lists[2])
     fill_small(
-        lists[0, :smalls], np.float32(0.0), a, b, c, u_px, v_px, w_per_m, width, height, stride,
-        flat_nearest_w, flat_farthest_w, rectangle,
+        lists[0, :smalls], np.float32(0.0), a, b, c, u_px, v_px, w_per_m, width, height, window, nearest_w, farthest_w
     )  # fmt: skip
     fill_small(
-        lists[1, :wides], np.float32(LANES), a, b, c, u_px, v_px, w_per_m, width, height, stride,
-        flat_nearest_w, flat_farthest_w, rectangle,
+        lists[1, :wides], np.float32(LANES), a, b, c, u_px, v_px, w_per_m, width, height, window, nearest_w, farthest_w
     )  # fmt: skip
     for n in range(larges):
         f = lists[2, n]
@@ -447,13 +337,74 @@ def draw_mesh(
                 np.float64(u_px[i]), np.float64(v_px[i]), np.float64(w_per_m[i]),
                 np.float64(u_px[j]), np.float64(v_px[j]), np.float64(w_per_m[j]),
                 np.float64(u_px[k]), np.float64(v_px[k]), np.float64(w_per_m[k]),
-                width, nearest_w, farthest_w, rectangle,
+                width, height, window, nearest_w, farthest_w,
             )  # fmt: skip
         else:
-            corners[0, 0], corners[0, 1], corners[0, 2] = x_m[i], y_m[i], z_m[i]
-            corners[1, 0], corners[1, 1], corners[1, 2] = x_m[j], y_m[j], z_m[j]
-            corners[2, 0], corners[2, 1], corners[2, 2] = x_m[k], y_m[k], z_m[k]
-            fill_clipped(corners, polygon, closed, fx, fy, cx, cy, near_m, width, nearest_w, farthest_w, rectangle)
+            corners_of(i, j, k, x_m, y_m, z_m, corners)
+            fill_clipped(corners, polygon, closed, camera, width, height, window, nearest_w, farthest_w)
+
+
+@kernel
+def span_of_row(
+    y: int, rectangles: NDArray[np.int32], chosen: NDArray[np.bool_], others: NDArray[np.bool_]
+) -> tuple[int, int]:
+    """First column and the one after the last of `rectangles` (M, 4) in row y, of the `chosen` and the `others` (M,).
+
+    (0, 0) when there is none.
+    """
+    first, end = 0, 0
+    for m in range(len(rectangles)):
+        if (chosen[m] or others[m]) and rectangles[m, 0] <= y <= rectangles[m, 1]:
+            first = min(first, rectangles[m, 2]) if end > 0 else rectangles[m, 2]
+            end = max(end, rectangles[m, 3] + 1)
+    return first, end
+
+
+@kernel
+def open_window(
+    rectangles: NDArray[np.int32],
+    chosen: NDArray[np.bool_],
+    others: NDArray[np.bool_],
+    window: NDArray[np.int64],
+    nearest_w: NDArray[np.float32],
+    farthest_w: NDArray[np.float32],
+) -> None:
+    """Lay the `window` about the `rectangles` (M, 4) of the `chosen` and the `others` (M,); clear what they reach."""
+    first_row, last_row, first_column, last_column = 2**30, -1, 2**30, -1
+    for m in range(len(rectangles)):
+        if (chosen[m] or others[m]) and rectangles[m, 0] <= rectangles[m, 1]:
+            first_row, last_row = min(first_row, rectangles[m, 0]), max(last_row, rectangles[m, 1])
+            first_column, last_column = min(first_column, rectangles[m, 2]), max(last_column, rectangles[m, 3])
+    if last_row < 0:
+        window[:] = 0
+        return
+    window[0], window[1] = first_row, first_column
+    window[2], window[3] = last_row - first_row + 1, last_column - first_column + 1 + LANES
+    for y in range(first_row, last_row + 1):
+        first, end = span_of_row(y, rectangles, chosen, others)
+        at = (y - first_row) * window[3] - first_column
+        nearest_w[at + first : at + end] = NOTHING_NEAREST
+        farthest_w[at + first : at + end] = NOTHING_FARTHEST
+
+
+@kernel
+def copy_window(
+    rectangles: NDArray[np.int32],
+    chosen: NDArray[np.bool_],
+    from_window: NDArray[np.int64],
+    from_nearest_w: NDArray[np.float32],
+    from_farthest_w: NDArray[np.float32],
+    window: NDArray[np.int64],
+    nearest_w: NDArray[np.float32],
+    farthest_w: NDArray[np.float32],
+) -> None:
+    """Copy what the `chosen` (M,) of the `rectangles` (M, 4) reach from one window to another, which encloses it."""
+    for y in range(from_window[0], from_window[0] + from_window[2]):
+        first, end = span_of_row(y, rectangles, chosen, chosen)
+        source = (y - from_window[0]) * from_window[3] - from_window[1]
+        at = (y - window[0]) * window[3] - window[1]
+        nearest_w[at + first : at + end] = from_nearest_w[source + first : source + end]
+        farthest_w[at + first : at + end] = from_farthest_w[source + first : source + end]
 
 
 @kernel
@@ -465,82 +416,51 @@ def draw_meshes(
     face_starts: NDArray[np.int32],
     closed: NDArray[np.bool_],
     chosen: NDArray[np.bool_],
-    T_camera_mesh: NDArray[np.float32],
+    others: NDArray[np.bool_],
+    T_camera_mesh: NDArray[np.float64],
     padding_m: NDArray[np.float32],
-    fx: np.float32,
-    fy: np.float32,
-    cx: np.float32,
-    cy: np.float32,
-    near_m: np.float32,
+    camera: NDArray[np.float32],
     width: int,
+    height: int,
     placed: NDArray[np.float32],
+    before: NDArray[np.int32],
     kinds: NDArray[np.uint8],
     lists: NDArray[np.int32],
     corners: NDArray[np.float32],
     polygon: NDArray[np.float64],
+    kept_window: NDArray[np.int64],
+    kept_nearest_w: NDArray[np.float32],
+    kept_farthest_w: NDArray[np.float32],
+    window: NDArray[np.int64],
     nearest_w: NDArray[np.float32],
     farthest_w: NDArray[np.float32],
     rectangles: NDArray[np.int32],
 ) -> None:
-    """Draw the `chosen` (M,) of M meshes, each with its pose and padding, into nearest and farthest inverse depth.
+    """Draw the `chosen` (M,) of M meshes over what is kept of the `others`, into nearest and farthest inverse depth.
 
-    They lie one after the other in `vertices_m` (3, V) and `faces` (3, F): mesh m has the vertices
-    `vertex_starts[m]:vertex_starts[m + 1]` and likewise faces, whose indices count from the mesh's own first vertex.
-    A vertex is drawn at `vertex + padding_m[m] * offset`, with `offsets` (3, V). Faces turned away are left out where a
-    mesh is `closed` (M,) (Algorithm 3). `T_camera_mesh` (M, 3, 4).
-
-    The buffers (H, at least width + LANES) are float32 of 1/m; what lies beyond `width` means nothing. `farthest_w` is
-    of the farthest *drawn* surface. `rectangles` (M, 4) of the chosen are set to the pixels that each may have touched,
-    first and last row, first and last column, empty (first > last) where it is not in view.
-    Scratch: `placed` (6, most vertices of a mesh), `kinds` (most faces,), `lists` (3, most faces + 1),
+    Meshes, poses and `rectangles` as in `project.place_meshes`. Faces turned away are left out where a mesh is `closed`
+    (M,) (Algorithm 3). The buffers of 1/m hold, where a rectangle reaches, `window` of the picture, which is laid anew;
+    they have room for H * (W + LANES) + LANES pixels. `farthest_w` is of the farthest *drawn* surface.
+    Scratch: `placed` (6, V), `before` (M,), `kinds` (most faces of a mesh,), `lists` (3, most faces + 1),
     `corners` (3, 3), `polygon` (4, 3).
     """
+    place_meshes(
+        vertices_m, offsets, faces, vertex_starts, face_starts, chosen, T_camera_mesh, padding_m, camera,
+        width, height, placed, before, corners, polygon, rectangles,
+    )  # fmt: skip
+    open_window(rectangles, chosen, others, window, nearest_w, farthest_w)
+    copy_window(
+        rectangles, others, kept_window, kept_nearest_w, kept_farthest_w, window, nearest_w, farthest_w
+    )  # fmt: skip
     for m in range(len(closed)):
-        if not chosen[m]:
+        first, end = vertex_starts[m], vertex_starts[m + 1]
+        if not chosen[m] or before[m] == end - first:
             continue
-        rectangles[m, 0] = len(nearest_w)
-        rectangles[m, 1] = -1
-        rectangles[m, 2] = width
-        rectangles[m, 3] = -1
-        draw_mesh(
-            vertices_m, offsets, faces,
-            vertex_starts[m], vertex_starts[m + 1], face_starts[m], face_starts[m + 1],
-            closed[m], T_camera_mesh[m], padding_m[m],
-            fx, fy, cx, cy, near_m, width,
-            placed, kinds, lists, corners, polygon,
-            nearest_w, farthest_w, rectangles[m],
+        a, b, c = faces[0], faces[1], faces[2]
+        start, stop = face_starts[m], face_starts[m + 1]
+        fill_mesh(
+            a[start:stop], b[start:stop], c[start:stop], closed[m], before[m],
+            placed[0, first:end], placed[1, first:end], placed[2, first:end],
+            placed[3, first:end], placed[4, first:end], placed[5, first:end],
+            camera, width, height, window, kinds[: stop - start], lists, corners, polygon, nearest_w, farthest_w,
         )  # fmt: skip
-
-
-@kernel
-def copy_rectangles(
-    rectangles: NDArray[np.int32],
-    chosen: NDArray[np.bool_],
-    from_nearest_w: NDArray[np.float32],
-    from_farthest_w: NDArray[np.float32],
-    nearest_w: NDArray[np.float32],
-    farthest_w: NDArray[np.float32],
-) -> None:
-    """Copy what was drawn inside the `chosen` (M,) of the `rectangles` (M, 4)."""
-    for m in range(len(rectangles)):
-        first, end = rectangles[m, 2], rectangles[m, 3] + 1
-        if chosen[m]:
-            for y in range(rectangles[m, 0], rectangles[m, 1] + 1):
-                nearest_w[y, first:end] = from_nearest_w[y, first:end]
-                farthest_w[y, first:end] = from_farthest_w[y, first:end]
-
-
-@kernel
-def clear_rectangles(
-    rectangles: NDArray[np.int32],
-    chosen: NDArray[np.bool_],
-    nearest_w: NDArray[np.float32],
-    farthest_w: NDArray[np.float32],
-) -> None:
-    """Forget what was drawn inside the `chosen` (M,) of the `rectangles` (M, 4)."""
-    for m in range(len(rectangles)):
-        first, end = rectangles[m, 2], rectangles[m, 3] + 1
-        if chosen[m]:
-            for y in range(rectangles[m, 0], rectangles[m, 1] + 1):
-                nearest_w[y, first:end] = NOTHING_NEAREST
-                farthest_w[y, first:end] = NOTHING_FARTHEST

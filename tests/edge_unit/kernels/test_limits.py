@@ -12,10 +12,9 @@ from edge_unit.kernels.limits import (
     lower_depth,
     nearest_over,
     robot_band_raw,
-    span_of_row,
     static_limit_raw,
 )
-from edge_unit.kernels.rasterize import NOTHING_FARTHEST, NOTHING_NEAREST
+from edge_unit.kernels.rasterize import LANES, NOTHING_FARTHEST
 
 SHAPE = (37, 61)
 
@@ -139,50 +138,51 @@ def between(rectangles: NDArray[np.int32]) -> NDArray[np.bool_]:
     return np.asarray(np.logical_or.accumulate(inside, 1) & np.logical_or.accumulate(inside[:, ::-1], 1)[:, ::-1])
 
 
-def test_the_span_of_a_row_holds_all_rectangles() -> None:
-    for y, row in enumerate(between(RECTANGLES)):
-        first, end = span_of_row(y, RECTANGLES)
-        assert np.nonzero(row)[0].tolist() == list(range(first, end))
+def windowed(
+    image: NDArray[np.float32], rectangles: NDArray[np.int32]
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """A window of an image (H, W), as the rasterizer leaves it, and its memory."""
+    rows, columns = np.nonzero(between(rectangles))
+    if not len(rows):
+        return np.zeros(4, np.int64), np.full(image.size, np.nan, np.float32)
+    window = np.array((rows.min(), columns.min(), np.ptp(rows) + 1, np.ptp(columns) + 1 + LANES))
+    memory = np.full((window[2], window[3]), np.nan, np.float32)
+    memory[:, :-LANES] = image[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    return window, np.append(memory.ravel(), np.full(50, np.nan, np.float32))
 
 
 class Band:
-    """The images of `robot_band_raw`, and drawings for it: buffers are wider than the picture."""
+    """The images of `robot_band_raw`."""
 
     def __init__(self) -> None:
         self.near_raw, self.span_raw = np.full(SHAPE, RAW_MAX, np.uint16), np.zeros(SHAPE, np.uint16)
         self.columns = np.zeros((SHAPE[0], 2), np.int32)
-        wide = (SHAPE[0], SHAPE[1] + 5)
-        self.kept = np.full(wide, NOTHING_NEAREST), np.full(wide, NOTHING_FARTHEST)
 
     def draw(self, rng: np.random.Generator, rectangles: NDArray[np.int32], scale_m: float) -> None:
         """Draw what is random, and compare all images with the twin's."""
-        near_m = rng.uniform(0.05, 8.0, self.kept[0].shape)
-        drawn = rng.random(near_m.shape) < 0.6
-        drawn[:, : SHAPE[1]] &= between(rectangles)
+        near_m = rng.uniform(0.05, 8.0, SHAPE)
+        inside = between(rectangles)
+        drawn = (rng.random(SHAPE) < 0.6) & inside
         nearest_w = np.where(drawn, 1.0 / near_m, 0.0).astype(np.float32)
-        far_m = near_m * rng.choice([1.0, 1.3], near_m.shape)
+        far_m = near_m * rng.choice([1.0, 1.3], SHAPE)
         farthest_w = np.where(drawn, 1.0 / far_m, NOTHING_FARTHEST).astype(np.float32)
-        drawing = nearest_w.copy(), farthest_w.copy()
+        window, nearest = windowed(nearest_w, rectangles)
+        _, farthest = windowed(farthest_w, rectangles)
+        links = np.ones(len(rectangles), np.bool_)
         robot_band_raw(
-            *drawing, *self.kept, rectangles, 0.02, 0.15, scale_m, self.near_raw, self.span_raw, self.columns
+            window, nearest, farthest, rectangles, links, 0.02, 0.15, scale_m,
+            self.near_raw, self.span_raw, self.columns,
         )  # fmt: skip
-        inner = np.s_[:, : SHAPE[1]]
-        low, high = band_twin(nearest_w[inner], farthest_w[inner], 0.02, 0.15, scale_m)
+        low, high = band_twin(nearest_w, farthest_w, 0.02, 0.15, scale_m)
         near, end = self.near_raw.astype(np.float64), self.near_raw.astype(np.float64) + self.span_raw
         slack = 1.0 + 1e-6 * RAW_MAX
         assert np.abs(near - low).max() <= slack
         assert np.abs(end - high).max() <= 1.0 + slack
         assert end.max() <= RAW_MAX
-        empty = ~drawn[inner]
-        assert (self.near_raw[empty] == RAW_MAX).all()
-        assert (self.span_raw[empty] == 0).all()
+        assert (self.near_raw[~drawn] == RAW_MAX).all()
+        assert (self.span_raw[~drawn] == 0).all()
         u = np.arange(SHAPE[1])
-        assert (((u >= self.columns[:, :1]) & (u < self.columns[:, 1:])) == between(rectangles)).all()
-        inside = between(rectangles)
-        for got, kept in zip(drawing, self.kept, strict=True):
-            assert (got[inner][inside] == kept[inner][inside]).all(), (
-                "the drawing is taken in, and what is kept put back"
-            )
+        assert (((u >= self.columns[:, :1]) & (u < self.columns[:, 1:])) == inside).all()
 
 
 @pytest.mark.parametrize("scale_m", [0.001, 0.0001, 0.01])
@@ -191,8 +191,6 @@ def test_robot_band_is_that_of_the_twin(seed: int, scale_m: float) -> None:
     """Again and again on the same images: of the robot that was there before nothing is left."""
     rng = np.random.default_rng(seed)
     band = Band()
-    for kept in band.kept:
-        kept[:] = rng.random(kept.shape)
     for _ in range(6):
         edges = np.sort(rng.integers(0, SHAPE[0], (3, 2))), np.sort(rng.integers(0, SHAPE[1], (3, 2)))
         band.draw(rng, np.concatenate(edges, axis=1).astype(np.int32), scale_m)
@@ -212,27 +210,24 @@ def test_a_band_is_cleared_wherever_it_is() -> None:
     band.draw(np.random.default_rng(0), RECTANGLES[:0], 0.001)
 
 
-def test_lower_depth_takes_the_nearer_and_puts_back_what_is_kept() -> None:
+def test_lower_depth_takes_the_nearer() -> None:
     rng = np.random.default_rng(0)
-    wide = (SHAPE[0], SHAPE[1] + 5)
-    z_m = np.where(rng.random(wide) < 0.5, rng.uniform(0.5, 3.0, wide), np.inf)
-    before_m = np.where(rng.random(SHAPE) < 0.5, rng.uniform(0.5, 3.0, SHAPE), np.inf).astype(np.float32)
-    nearest_w, farthest_w = (1.0 / z_m).astype(np.float32), np.ones(wide, np.float32)
-    kept = rng.random((2, *wide)).astype(np.float32)
-    depth_m = before_m.copy()
-    lower_depth(nearest_w, farthest_w, *kept, RECTANGLES, depth_m)
     inside = between(RECTANGLES)
-    assert np.allclose(depth_m[inside], np.minimum(before_m, z_m[:, : SHAPE[1]])[inside])
-    assert (depth_m[~inside] == before_m[~inside]).all()
-    assert (nearest_w[:, : SHAPE[1]][inside] == kept[0][:, : SHAPE[1]][inside]).all()
-    assert (farthest_w[:, : SHAPE[1]][inside] == kept[1][:, : SHAPE[1]][inside]).all()
+    z_m = np.where(inside & (rng.random(SHAPE) < 0.5), rng.uniform(0.5, 3.0, SHAPE), np.inf)
+    before_m = np.where(rng.random(SHAPE) < 0.5, rng.uniform(0.5, 3.0, SHAPE), np.inf).astype(np.float32)
+    depth_m = before_m.copy()
+    window, nearest = windowed((1.0 / z_m).astype(np.float32), RECTANGLES)
+    lower_depth(window, nearest, RECTANGLES, np.ones(4, np.bool_), depth_m)
+    assert np.allclose(depth_m, np.minimum(before_m, z_m))
+    lower_depth(np.zeros(4, np.int64), nearest, RECTANGLES[3:], np.ones(1, np.bool_), depth_m)
 
 
 def test_robot_band_of_a_surface_at_the_camera_starts_at_0() -> None:
     """What lies nearer than a band that begins at 0 would wrap around; nothing does."""
-    w, kept = np.full((1, 1), 1 / 0.05, np.float32), np.zeros((1, 1), np.float32)
+    w, one = np.full(1, 1 / 0.05, np.float32), np.ones(1, np.bool_)
     near_raw, span_raw = np.zeros((1, 1), np.uint16), np.zeros((1, 1), np.uint16)
-    rectangles, columns = np.array([[0, 0, 0, 0]], np.int32), np.zeros((1, 2), np.int32)
-    robot_band_raw(w, w.copy(), kept, kept, rectangles, 50.0, 0.15, 0.001, near_raw, span_raw, columns)
+    window, rectangles = np.array((0, 0, 1, 1)), np.array([[0, 0, 0, 0]], np.int32)
+    columns = np.zeros((1, 2), np.int32)
+    robot_band_raw(window, w, w, rectangles, one, 50.0, 0.15, 0.001, near_raw, span_raw, columns)
     assert near_raw[0, 0] == 0
     assert span_raw[0, 0] == pytest.approx(50 + 125 + 150, abs=1)

@@ -1,21 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from edge_unit.kernels.rasterize import (
-    LANES,
-    NOTHING_FARTHEST,
-    NOTHING_NEAREST,
-    SMALL_ROWS,
-    clear_rectangles,
-    copy_rectangles,
-    draw_meshes,
-)
+from edge_unit.kernels.rasterize import LANES, NOTHING_FARTHEST, NOTHING_NEAREST, SMALL_ROWS, draw_meshes, span_of_row
 from shared.meshes import TriangleMesh, box_mesh, sphere_mesh
 from shared.transforms import Transform, apply, from_xyz_rpy, look_at
 
@@ -33,18 +26,17 @@ class Screen:
     f_px: float = 40.0
 
     def __post_init__(self) -> None:
-        shape = (self.height, self.width + LANES)
-        self.memory = np.full(shape, NOTHING_NEAREST, np.float32), np.full(shape, NOTHING_FARTHEST, np.float32)
-        self.rectangles = np.zeros((0, 4), np.int32)
+        self.buffer = Window(self)
+        self.rectangles, self.shown = np.zeros((0, 4), np.int32), np.zeros(0, np.bool_)
         self.cx, self.cy = (self.width - 1) / 2.0, (self.height - 1) / 2.0
 
     @property
     def nearest_w(self) -> NDArray[np.float32]:
-        return self.memory[0][:, : self.width]
+        return self.buffer.picture(self.rectangles)[0]
 
     @property
     def farthest_w(self) -> NDArray[np.float32]:
-        return self.memory[1][:, : self.width]
+        return self.buffer.picture(self.rectangles)[1]
 
     @property
     def drawn(self) -> NDArray[np.bool_]:
@@ -57,13 +49,18 @@ class Screen:
         padding_m: float = 0.0,
         offsets: list[NDArray[np.float32]] | None = None,
         chosen: list[bool] | None = None,
+        over: Screen | None = None,
     ) -> Screen:
+        """Draw all meshes, or the `chosen` over what `over` has drawn of the others."""
         vertices = [mesh.vertices for mesh in meshes]
         offsets = offsets or [np.zeros_like(points) for points in vertices]
         nothing = np.zeros((0, 3), np.float32)
-        self.rectangles = np.full((len(meshes), 4), 77, np.int32)
+        self.rectangles = np.full((len(meshes), 4), 77, np.int32) if over is None else over.rectangles.copy()
         faces = [*(mesh.faces for mesh in meshes), np.zeros((0, 3), np.int32)]
-        most_vertices, most_faces = max([1, *map(len, vertices)]), max(map(len, faces))
+        most_faces = max(map(len, faces))
+        mine = np.ones(len(meshes), np.bool_) if chosen is None else np.array(chosen)
+        kept = self.buffer if over is None else over.buffer
+        self.shown = mine if over is None else np.ones(len(meshes), np.bool_)
         draw_meshes(
             np.concatenate([*vertices, nothing]).T.copy(),
             np.concatenate([*offsets, nothing]).T.copy(),
@@ -71,24 +68,58 @@ class Screen:
             np.cumsum([0, *(len(points) for points in vertices)]).astype(np.int32),
             np.cumsum([0, *(len(mesh.faces) for mesh in meshes)]).astype(np.int32),
             np.array([mesh.closed for mesh in meshes], np.bool_),
-            np.ones(len(meshes), np.bool_) if chosen is None else np.array(chosen),
-            np.array(T_camera_mesh, np.float32).reshape(-1, 4, 4)[:, :3].copy(),
+            mine,
+            np.zeros_like(mine) if over is None else ~mine,
+            np.array(T_camera_mesh, np.float64).reshape(-1, 4, 4),
             np.full(len(meshes), padding_m, np.float32),
-            np.float32(self.f_px),
-            np.float32(self.f_px),
-            np.float32(self.cx),
-            np.float32(self.cy),
-            np.float32(NEAR_M),
+            np.array((self.f_px, self.f_px, self.cx, self.cy, NEAR_M), np.float32),
             self.width,
-            np.empty((6, most_vertices), np.float32),
+            self.height,
+            np.empty((6, sum(map(len, vertices))), np.float32),
+            np.empty(len(meshes), np.int32),
             np.empty(most_faces, np.uint8),
             np.empty((3, most_faces + 1), np.int32),
             np.empty((3, 3), np.float32),
             np.empty((4, 3), np.float64),
-            *self.memory,
+            kept.window,
+            *kept.memory,
+            self.buffer.window,
+            *self.buffer.memory,
             self.rectangles,
         )
+        self.buffer.check()
         return self
+
+
+class Window:
+    """The memory of a window, full of what must not be taken for a drawing, with a guard behind it."""
+
+    STALE = np.float32(np.nan)
+
+    def __init__(self, screen: Screen) -> None:
+        self.screen = screen
+        self.size = screen.height * (screen.width + LANES) + LANES
+        self.memory = np.full(self.size + 100, self.STALE), np.full(self.size + 100, self.STALE)
+        self.window = np.full(4, 5, np.int64)
+
+    def check(self) -> None:
+        """Nothing was written behind the memory, and the window lies inside the picture."""
+        row, column, rows, stride = self.window.tolist()
+        assert all(np.isnan(memory[self.size :]).all() for memory in self.memory)
+        assert rows == 0 or 0 <= row < row + rows <= self.screen.height
+        assert rows == 0 or 0 <= column < column + stride - LANES <= self.screen.width
+
+    def picture(self, rectangles: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Both buffers as whole images (H, W), with nothing beside the rectangles."""
+        row, column, rows, stride = self.window.tolist()
+        shape = (self.screen.height, self.screen.width)
+        out = np.full(shape, NOTHING_NEAREST, np.float32), np.full(shape, NOTHING_FARTHEST, np.float32)
+        for y in range(row, row + rows):
+            first, end = span_of_row(y, rectangles, self.screen.shown, self.screen.shown)
+            at = (y - row) * stride - column
+            for image, memory in zip(out, self.memory, strict=True):
+                image[y, first:end] = memory[at + first : at + end]
+        return out
 
 
 def clipped(triangle: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -243,25 +274,34 @@ def test_rectangles_hold_what_was_drawn_and_clear_it(seed: int) -> None:
         assert columns.max() <= right < screen.width
         assert (bottom - top) <= np.ptp(rows) + 2
         assert (right - left) <= np.ptp(columns) + 2
-        clear_rectangles(screen.rectangles, np.ones(1, np.bool_), *screen.memory)
-        assert (screen.nearest_w == NOTHING_NEAREST).all()
-        assert (screen.farthest_w == NOTHING_FARTHEST).all()
 
 
-def test_only_the_chosen_are_drawn_copied_and_cleared() -> None:
+def test_what_is_kept_and_what_is_drawn_over_it_are_as_if_drawn_together() -> None:
+    """Apart, overlapping, and beyond the picture; whatever the memory held before."""
     ball = sphere_mesh("ball", 0.2)
-    poses = [from_xyz_rpy((x, 0.0, 1.0), (0, 0, 0)) for x in (-0.4, 0.0, 0.4)]
-    both, first = Screen(), Screen()
-    both.draw([ball] * 3, poses, chosen=[True, False, True])
-    assert (both.rectangles[1] == 77).all()
-    first.draw([ball], poses[:1])
-    copied = Screen()
-    copy_rectangles(both.rectangles, np.array([True, False, False]), *both.memory, *copied.memory)
-    assert (copied.nearest_w == first.nearest_w).all()
-    assert (copied.farthest_w == first.farthest_w).all()
-    clear_rectangles(both.rectangles, np.array([False, False, True]), *both.memory)
-    assert (both.nearest_w == first.nearest_w).all()
-    assert (both.farthest_w == first.farthest_w).all()
+    for x in ([-0.4, 0.1, 0.4], [0.0, 0.05, 0.1], [-3.0, 0.0, 0.4], [0.4, -3.0, 3.0], [3.0, 3.0, -3.0]):
+        poses = [from_xyz_rpy((x[n], 0.1 * n, 1.0 + 0.1 * n), (0, 0, 0)) for n in range(3)]
+        together = Screen().draw([ball] * 3, poses)
+        for chosen in itertools.product([True, False], repeat=3):
+            kept = Screen().draw([ball] * 3, poses, chosen=[not each for each in chosen])
+            assert (kept.rectangles[list(chosen)] == 77).all()
+            over = Screen().draw([ball] * 3, poses, chosen=list(chosen), over=kept)
+            assert (over.nearest_w == together.nearest_w).all()
+            assert (over.farthest_w == together.farthest_w).all()
+            assert (over.rectangles == together.rectangles).all()
+
+
+def test_the_span_of_a_row_is_that_of_all_that_are_asked_for() -> None:
+    rectangles = np.array([[2, 20, 5, 40], [10, 30, 30, 60], [36, 36, 0, 60], [37, -1, 61, -1]], np.int32)
+    for chosen, others in itertools.product(itertools.product([True, False], repeat=4), repeat=2):
+        for y in (0, 2, 9, 10, 20, 21, 36, 40):
+            columns = [
+                (left, right + 1)
+                for (top, bottom, left, right), mine, other in zip(rectangles.tolist(), chosen, others, strict=True)
+                if top <= y <= bottom and (mine or other)
+            ]
+            wanted = (min(left for left, _ in columns), max(end for _, end in columns)) if columns else (0, 0)
+            assert span_of_row(y, rectangles, np.array(chosen), np.array(others)) == wanted
 
 
 @pytest.mark.parametrize("columns", [LANES, 2 * LANES])

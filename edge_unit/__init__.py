@@ -9,6 +9,7 @@ In the order of the flow:
     recording       a folder of images becomes a recording that the RealSense SDK plays
     inflation       how a mesh grows by a padding
     hull            a link as the solid that reaches a few centimetres around it
+    links           the robot's links as they stand before one camera
     drawing         meshes and links drawn into buffers of inverse depth
     expected_depth  what the camera should see: static layer and robot layer (Algorithms 2 to 5)
     halo            what edges of the CAD make the camera see beside them

@@ -14,6 +14,7 @@ from edge_unit.expected_depth import BareRobot, RobotLayer, StaticLayer
 from edge_unit.halo import EdgeHalo
 from edge_unit.health import Health, HealthCheck
 from edge_unit.kernels import foreground, limits
+from edge_unit.links import Links
 from edge_unit.reference import Reference, ReferenceLearner
 from edge_unit.visibility import SeenBlocks, Visibility
 from edge_unit.voxels import Voxelizer, Voxels
@@ -29,6 +30,9 @@ Kind = TypeVar("Kind")
 
 EDGE_RADIUS_WIDTH_PX = 1280
 """`edge_radius_px` is given for this width; an edge's blur covers the same angle at every resolution."""
+
+EXACT: ArrayLike = 0.0
+"""The uncertainty of joints that are known."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,7 @@ class DepthPipeline:
     # ------------------------------------------------------------------ what a frame goes through
 
     def process(
-        self, depth: NDArray[np.uint16], joints: ArrayLike | None, *, joint_uncertainty_rad: ArrayLike = 0.0
+        self, depth: NDArray[np.uint16], joints: ArrayLike | None, *, joint_uncertainty_rad: ArrayLike = EXACT
     ) -> Voxels:
         """Obstacle voxels of one frame.
 
@@ -115,7 +119,7 @@ class DepthPipeline:
         return voxels
 
     def foreground(
-        self, depth: NDArray[np.uint16], joints: ArrayLike | None, *, joint_uncertainty_rad: ArrayLike = 0.0
+        self, depth: NDArray[np.uint16], joints: ArrayLike | None, *, joint_uncertainty_rad: ArrayLike = EXACT
     ) -> NDArray[np.bool_]:
         """The pixels (H, W) that survive the filter; arguments and errors as in `process`."""
         depth_raw = self.intrinsics.check_depth(depth)
@@ -125,16 +129,16 @@ class DepthPipeline:
         return mask.view(np.bool_)
 
     def expected_depth(
-        self, joints: ArrayLike | None, *, joint_uncertainty_rad: ArrayLike = 0.0
+        self, joints: ArrayLike | None, *, joint_uncertainty_rad: ArrayLike = EXACT
     ) -> NDArray[np.float32]:
         """Depth (H, W) in metres of the nearest known surface, unpadded; inf where nothing is known.
 
         Without joints the robot is not known. The uncertainty pads the filter only, never what is expected.
         """
         nearest_m = self._static_depth_m.copy()
-        if self.cell.robot is not None and joints is not None:
+        if self._links is not None and joints is not None:
             self._check_uncertainty(joint_uncertainty_rad)
-            self._bare_robot.lower(self._T_camera_link(joints), nearest_m)
+            self._bare_robot.lower(self._links.place(joints), nearest_m)
         return nearest_m
 
     def seen(self) -> SeenBlocks:
@@ -181,7 +185,7 @@ class DepthPipeline:
         depth_raw = self.intrinsics.check_depth(depth)
         if self.cell.robot is not None and joints is None:
             raise InputError("learn: expected joints with every frame, for the robot must not be learned as background")
-        self._place_robot(joints, 0.0, hidden=self._fixed_links)
+        self._place_robot(joints, EXACT, hidden=self._fixed_links)
         learner.add(depth_raw, self._robot.near_raw, self._robot.span_raw)
 
     def use(self, reference: Reference | None) -> None:
@@ -265,22 +269,23 @@ class DepthPipeline:
         self, joints: ArrayLike | None, joint_uncertainty_rad: ArrayLike, hidden: NDArray[np.bool_] | None = None
     ) -> None:
         """Draw the padded robot as it stood when the frame was taken."""
-        robot = self.cell.robot
-        if robot is None:
+        if self._links is None:
             return
         uncertainty = self._check_uncertainty(joint_uncertainty_rad)
         if joints is None:
             self._robot.forget()
             return
-        padding_m = np.full(len(robot.links), self.settings.robot_padding_m)
-        if uncertainty.any():
-            padding_m += robot.displacement_m(uncertainty, joints)
+        settings = self.settings
+        T_camera_link = self._links.place(joints)
+        padding_m = np.full(len(T_camera_link), settings.robot_padding_m, np.float32)
+        if uncertainty is not None:
+            padding_m += self._links.displacement_m(uncertainty)
         self._robot.draw(
-            self._T_camera_link(joints),
-            padding_m.astype(np.float32),
-            self.settings.margin_noise_gain * self._noise_per_m,
+            T_camera_link,
+            padding_m,
+            settings.margin_noise_gain * self._noise_per_m,
             # The padded surface stands before the true one by the padding.
-            self.settings.robot_depth_m + float(padding_m.max(initial=0.0)),
+            settings.robot_depth_m + float(padding_m.max(initial=0.0)),
             hidden,
         )
 
@@ -306,7 +311,7 @@ class DepthPipeline:
     def _draw_cad(self) -> None:
         """Place what does not move before the camera: CAD, objects, and the robot's base."""
         T_camera_world = inverse(self.T_world_camera)
-        self._T_camera_base = T_camera_world @ self.cell.robot.T_world_base if self.cell.robot else T_camera_world
+        self._links = Links(self.cell.robot, T_camera_world) if self.cell.robot else None
         placed = (*self.cell.static, *self.cell.objects)
         self._cad.draw(self.T_world_camera, [each.T_world_mesh for each in placed])
 
@@ -351,14 +356,10 @@ class DepthPipeline:
             self.intrinsics.disparity_noise_m(settings.stereo_subpixel_px),
         )
 
-    def _T_camera_link(self, joints: ArrayLike) -> NDArray[np.float64]:
-        """Poses (L, 4, 4) of the robot's links in the camera frame."""
-        robot = self.cell.robot
-        assert robot is not None
-        return self._T_camera_base @ robot.link_poses(joints)
-
-    def _check_uncertainty(self, joint_uncertainty_rad: ArrayLike) -> NDArray[np.float64]:
-        """The uncertainty of all joints () or of each (n,)."""
+    def _check_uncertainty(self, joint_uncertainty_rad: ArrayLike) -> NDArray[np.float64] | None:
+        """The uncertainty (n,) of each joint; None when there is none."""
+        if joint_uncertainty_rad is EXACT:
+            return None
         robot = self.cell.robot
         count = robot.joint_count if robot else 0
         try:
@@ -371,7 +372,7 @@ class DepthPipeline:
                 f"joint_uncertainty_rad: expected one finite number of at least 0, or {count}, "
                 f"got {uncertainty.tolist()}"
             )
-        return uncertainty
+        return np.array(np.broadcast_to(uncertainty, (count,))) if uncertainty.any() else None
 
     @property
     def _noise_per_m(self) -> float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,6 +42,32 @@ class Link:
     mesh: TriangleMesh
     moving: bool
     index: int
+
+
+class LinkTable(NamedTuple):
+    """What the links' poses follow from, as flat arrays; for who must reckon them faster than `Robot.link_poses`.
+
+    Of each of J moving joints, parents first: `parent` (J,) its parent's row, `BASE` for the robot's base; `dof` (J,),
+    `multiplier` (J,), `offset` (J,) how its value follows from the positions; `is_turning` (J,); `axis` (J, 3) in its
+    own frame; `fixed`, `sine`, `versine`, `shift` (J, 4, 4), of which `T_parent_joint` is the sum, the latter three
+    times sin(q), 1 - cos(q) and q. Of each of L links: `body` (L,) the joint that it hangs on, or `BASE`; `T_body_link`
+    (L, 4, 4); `chain` (L, J), which joints move it; `corners` (L, 8, 3) of its bounding box.
+    """
+
+    parent: NDArray[np.int64]
+    dof: NDArray[np.int64]
+    multiplier: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    is_turning: NDArray[np.bool_]
+    axis: NDArray[np.float64]
+    fixed: NDArray[np.float64]
+    sine: NDArray[np.float64]
+    versine: NDArray[np.float64]
+    shift: NDArray[np.float64]
+    body: NDArray[np.int64]
+    T_body_link: NDArray[np.float64]
+    chain: NDArray[np.bool_]
+    corners: NDArray[np.float64]
 
 
 class Robot:
@@ -99,6 +125,26 @@ class Robot:
     def frame_names(self) -> tuple[str, ...]:
         """All frames that `frame_pose` knows."""
         return tuple(self._frames)
+
+    @property
+    def link_table(self) -> LinkTable:
+        """What `link_poses` and `displacement_m` reckon with."""
+        return LinkTable(
+            np.array(self._parent, np.int64),
+            self._dof.astype(np.int64),
+            self._multiplier,
+            self._offset,
+            self._is_turning,
+            self._axis,
+            self._fixed,
+            self._sine,
+            self._versine,
+            self._shift,
+            self._link_body.astype(np.int64),
+            self._T_body_link,
+            self._link_chain,
+            self._link_corners,
+        )
 
     def check_joints(self, joints: ArrayLike) -> NDArray[np.float64]:
         """Return `joints` as (n,) float64.

@@ -47,6 +47,7 @@ test: $(READY) libusb lint ## lint, then all tests but the slow ones; with SLOW=
 lint: $(READY) ## ruff and mypy
 	@failed=0; \
 	$(BIN)/ruff check -q . || failed=1; \
+	$(BIN)/ruff format -q --check . || failed=1; \
 	$(if $(TYPED),$(BIN)/mypy --no-error-summary $(TYPED) || failed=1;) \
 	exit $$failed
 

@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make bench-pipeline`: what a frame costs, beside Open3D, OctoMap, Embree and a memcpy on the same frames.
 
-All on one thread and in turns, so that whatever else the machine does falls on all of them; figures are medians of the
-rounds, ratios those of medians. Peers are given for nothing what does not change from frame to frame.
+All on one thread and in turns of a few frames, so that whatever else the machine does falls on all of them. Figures are
+medians over all frames, ratios those of medians. The first frame of a turn is told apart, too: the others have emptied
+the caches then, as the other programs of a board do between two frames of a camera.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.peers import Camera, Embree, OctoMap, Open3D
-from benchmarks.report import RESULTS, Mark, table
-from benchmarks.ur3_scene import record
+from benchmarks.report import RESULTS, Mark, line, table, write
+from benchmarks.ur3_scene import Recording, record
 from shared.clock import NS_PER_MS, stage_ns
 from shared.errors import CellwatchError
 
@@ -27,133 +27,199 @@ VOXEL_M = 0.02
 WORST_VOXEL_M = 0.01
 VOXEL_SIZES_M = (0.01, 0.02, 0.03, 0.05, 0.1)
 RESOLUTIONS = ((424, 240), (640, 480), (848, 480), (1280, 720))
+SIZE = (1280, 720)
 FRAMES = 8
-TABLE_ROUNDS = 24
+FRAMES_A_TURN = 3
+TABLE_TURNS = 8
+
+ARBITRARY_RAW = (300, 2500)
+"""Each pixel of the worst frame has a depth of its own from this range: no frame touches more voxels."""
+
+PACKAGES = ("numpy", "numba", "open3d", "octomap-python", "embreex")
+
+Work = Callable[[int], object]
+
+
+class Spent:
+    """Milliseconds that the frames of one contender took, turn by turn."""
+
+    def __init__(self) -> None:
+        self.turns: list[list[float]] = []
+
+    @property
+    def median(self) -> float:
+        """Over all frames."""
+        return float(np.median(self.turns))
+
+    @property
+    def p99(self) -> float:
+        """Over all frames."""
+        return float(np.percentile(self.turns, 99))
+
+    @property
+    def first(self) -> float:
+        """Median of the first frames of the turns: others have emptied the caches."""
+        return float(np.median([turn[0] for turn in self.turns]))
+
+
+def in_turns(contenders: Mapping[str, Work], turns: int, frames: int = FRAMES) -> dict[str, Spent]:
+    """Have each of them do a few frames, then the next, and so on; the first round compiles and is not counted."""
+    spent = {name: Spent() for name in contenders}
+    for turn in range(turns + 1):
+        for name, work in contenders.items():
+            took_ms = []
+            for k in range(FRAMES_A_TURN):
+                began_ns = stage_ns()
+                work((turn * FRAMES_A_TURN + k) % frames)
+                took_ms.append((stage_ns() - began_ns) / NS_PER_MS)
+            if turn > 0:
+                spent[name].turns.append(took_ms)
+    return spent
+
+
+def contenders_of(frames: Recording) -> dict[str, Work]:
+    """Ours and theirs, by name; each takes the number of a frame."""
+    from benchmarks import peers
+
+    pipeline, still = frames.pipeline(VOXEL_M), frames.pipeline(VOXEL_M)
+    unknowing = frames.pipeline_that_knows_nothing(WORST_VOXEL_M)
+    depth, joints, surface = frames.depth, frames.joints, frames.unhindered
+    arbitrary = np.random.default_rng(0).integers(*ARBITRARY_RAW, depth.shape).astype(np.uint16)
+    camera = peers.Camera(frames.intrinsics, frames.T_world_camera, frames.cell)
+    open3d, embree = peers.Open3D(camera, pipeline.settings), peers.Embree(camera)
+    octomap = peers.OctoMap(camera, VOXEL_M)
+    marked = [pipeline.foreground(depth[n], joints[n]) for n in range(len(depth))]
+    points_m = [camera.points_m(depth[n], marked[n]) for n in range(len(depth))]
+    everything = np.ones(frames.intrinsics.shape, np.bool_)
+    copies = np.zeros((2, *frames.intrinsics.shape), np.uint16)
+
+    def copy_two_images(n: int) -> None:
+        np.copyto(copies[0], depth[n])
+        np.copyto(copies[1], surface[n])
+
+    return {
+        "process()": lambda n: pipeline.process(depth[n], joints[n]),
+        "Open3D, the same work": lambda n: open3d.process(depth[n], joints[n], VOXEL_M),
+        "OctoMap, the same points": lambda n: octomap.insert(points_m[n]),
+        "expected_depth()": lambda n: pipeline.expected_depth(joints[n]),
+        "Embree, the same picture": lambda n: embree.expected_depth(joints[n]),
+        "Embree, the robot alone": lambda n: embree.robot_depth(joints[n]),
+        "Embree, link by link": lambda n: embree.robot_depth_link_by_link(joints[n]),
+        "filter": lambda n: still.foreground(depth[n], joints[0]),
+        "memcpy of two images": copy_two_images,
+        "seen() and health()": lambda n: (pipeline.seen(), pipeline.health()),
+        "all foreground, arbitrary depths": lambda n: unknowing.process(arbitrary[n], None),
+        "Open3D, arbitrary depths at 20 mm": lambda n: open3d.voxels(arbitrary[n], everything, VOXEL_M),
+        "all foreground, the room's surfaces": lambda n: unknowing.process(surface[n], None),
+        "Open3D, the room's surfaces at 20 mm": lambda n: open3d.voxels(surface[n], everything, VOXEL_M),
+    }
+
+
+def compare(frames: Recording, turns: int) -> tuple[dict[str, Any], list[Mark]]:
+    """What a frame costs beside its peers: figures by name, and the marks that they are held against."""
+    spent = in_turns(contenders_of(frames), turns, len(frames.depth))
+    rows = [(name, each.median, each.p99, each.first) for name, each in spent.items()]
+    print(f"{SIZE[0]}x{SIZE[1]}, UR3, {VOXEL_M * 1e3:g} mm voxels, one thread, {turns} turns of {FRAMES_A_TURN} frames")
+    print("\n".join(table(("what", "median ms", "p99 ms", "first of a turn"), rows)), flush=True)
+
+    def times(theirs: str, ours: str) -> float:
+        return spent[theirs].median / spent[ours].median
+
+    def times_at_first(theirs: str, ours: str) -> float:
+        return spent[theirs].first / spent[ours].first
+
+    pipeline = frames.pipeline(VOXEL_M)
+    share = [
+        pipeline.foreground(depth, joints).mean() for depth, joints in zip(frames.depth, frames.joints, strict=True)
+    ]
+    arbitrary, surface = "all foreground, arbitrary depths", "all foreground, the room's surfaces"
+    figures: dict[str, Any] = {
+        "process_ms": spent["process()"].median,
+        "process_p99_ms": spent["process()"].p99,
+        "process_cold_ms": spent["process()"].first,
+        "foreground_share": float(np.mean(share)),
+        "vs_open3d": times("Open3D, the same work", "process()"),
+        "vs_open3d_cold": times_at_first("Open3D, the same work", "process()"),
+        "vs_octomap": times("OctoMap, the same points", "process()"),
+        "vs_octomap_cold": times_at_first("OctoMap, the same points", "process()"),
+        "filter_vs_memcpy": spent["filter"].median / spent["memcpy of two images"].median,
+        "expected_depth_ms": spent["expected_depth()"].median,
+        "expected_depth_vs_embree": times("Embree, the same picture", "expected_depth()"),
+        "expected_depth_vs_embree_robot_alone": times("Embree, the robot alone", "expected_depth()"),
+        "expected_depth_vs_embree_link_by_link": times("Embree, link by link", "expected_depth()"),
+        "worst_case_ms": spent[arbitrary].median,
+        "worst_case_vs_open3d": times("Open3D, arbitrary depths at 20 mm", arbitrary),
+        "worst_case_vs_open3d_cold": times_at_first("Open3D, arbitrary depths at 20 mm", arbitrary),
+        "surfaces_ms": spent[surface].median,
+        "surfaces_vs_open3d": times("Open3D, the room's surfaces at 20 mm", surface),
+        "seen_and_health_ms": spent["seen() and health()"].median,
+        "spent_ms": {n: {"median": s.median, "p99": s.p99, "first": s.first} for n, s in spent.items()},
+    }
+    marks = [
+        Mark("process(), times faster than Open3D", figures["vs_open3d"], at_least=30.0),
+        Mark("process(), times faster than OctoMap", figures["vs_octomap"], at_least=30.0),
+        Mark("expected depth, times faster than Embree", figures["expected_depth_vs_embree"], at_least=30.0),
+        Mark("filter, in memcpys of two images", figures["filter_vs_memcpy"], at_most=4.0),
+        Mark("worst case, times faster than Open3D", figures["worst_case_vs_open3d"], at_least=8.0),
+    ]
+    return figures, marks
+
+
+def costs_by_size(recordings: Sequence[Recording], turns: int) -> tuple[dict[str, Any], list[Mark]]:
+    """Milliseconds of `process()` by resolution and voxel size, on the same frames."""
+    costs: dict[str, dict[str, float]] = {}
+    for frames in recordings:
+        pipelines = {f"{size * 1e3:g} mm": frames.pipeline(size) for size in VOXEL_SIZES_M}
+        works: dict[str, Work] = {
+            name: lambda n, each=each, frames=frames: each.process(frames.depth[n], frames.joints[n])
+            for name, each in pipelines.items()
+        }  # fmt: skip
+        spent = in_turns(works, turns, len(frames.depth))
+        size = f"{frames.intrinsics.width}x{frames.intrinsics.height}"
+        costs[size] = {name: each.median for name, each in spent.items()}
+    print("process(), median ms by resolution and voxel size, 10 % of the pixels foreground")
+    rows: list[tuple[str | float, ...]] = [(name, *each.values()) for name, each in costs.items()]
+    print("\n".join(table(("", *next(iter(costs.values()))), rows)), flush=True)
+    ratio = max(each["10 mm"] / each["50 mm"] for each in costs.values())
+    return {"process_ms_by_size": costs}, [Mark("10 mm voxels, in costs of 50 mm", ratio, at_most=2.0)]
+
+
+def single_thread() -> None:
+    """Ours has one thread; before they are imported, have the peers on one, too."""
+    os.environ.update(OMP_NUM_THREADS="1", TBB_NUM_THREADS="1")
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+
+
+def machine() -> dict[str, str]:
+    """On what it was measured."""
+    models = [row.partition(":")[2].strip() for row in Path("/proc/cpuinfo").read_text().splitlines() if "model" in row]
+    return {"cpu": models[-1] if models else "unknown"} | {name: metadata.version(name) for name in PACKAGES}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, print the tables, and one JSON line last. Exit code 1 when a mark is missed."""
+    """Measure, print the tables, and all of it as one line of JSON. Exit code 1 when a mark is missed."""
     options = _parser().parse_args(arguments)
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    single_thread()
     try:
-        result, marks = measure(options.rounds)
-    except CellwatchError as error:
+        frames = record(*SIZE, FRAMES)
+        figures, marks = compare(frames, options.turns)
+        others = [record(*size, FRAMES) for size in RESOLUTIONS if size != SIZE]
+        sizes, more = costs_by_size([*others, frames], min(options.turns, TABLE_TURNS))
+    except (CellwatchError, ImportError) as error:
         print(f"make bench-pipeline: {error}", file=sys.stderr)
         return 1
-    for mark in marks:
-        print(mark)
-    result["marks"] = [mark.document() for mark in marks]
-    options.results.mkdir(parents=True, exist_ok=True)
-    (options.results / "pipeline.json").write_text(json.dumps(result, indent=1) + "\n")
-    print(json.dumps(result))
-    return 0 if all(mark.met for mark in marks) else 1
-
-
-def measure(rounds: int) -> tuple[dict[str, Any], list[Mark]]:
-    """All figures, by name, and the marks that they are held against."""
-    frames = record(1280, 720, FRAMES)
-    pipeline = frames.pipeline(VOXEL_M)
-    empty = frames.pipeline_that_knows_nothing(WORST_VOXEL_M)
-    camera = Camera(frames.intrinsics, frames.T_world_camera, frames.cell)
-    open3d, embree = Open3D(camera, pipeline.settings), Embree(camera)
-    octomap = OctoMap(camera, VOXEL_M)
-    points_m = [
-        camera.points_m(depth, pipeline.foreground(depth, joints))
-        for depth, joints in zip(frames.depth, frames.joints, strict=True)
-    ]
-    one, other = np.zeros(frames.intrinsics.shape, np.uint16), np.zeros(frames.intrinsics.shape, np.uint16)
-    everything = np.ones(frames.intrinsics.shape, np.bool_)
-
-    def copy(n: int) -> None:
-        np.copyto(one, frames.depth[n])
-        np.copyto(other, frames.unhindered[n])
-
-    contenders: dict[str, Callable[[int], object]] = {
-        "process": lambda n: pipeline.process(frames.depth[n], frames.joints[n]),
-        "open3d": lambda n: open3d.process(frames.depth[n], frames.joints[n], VOXEL_M),
-        "octomap": lambda n: octomap.insert(points_m[n]),
-        "expected depth": lambda n: pipeline.expected_depth(frames.joints[n]),
-        "embree": lambda n: embree.expected_depth(frames.joints[n]),
-        "memcpy": copy,
-        "worst case": lambda n: empty.process(frames.unhindered[n], None),
-        "open3d, all points at 20 mm": lambda n: open3d.voxels(frames.unhindered[n], everything, VOXEL_M),
-    }
-    spent_ms: dict[str, list[float]] = {name: [] for name in (*contenders, "robot layer")}
-    for turn in range(rounds + 2):
-        for name, work in contenders.items():
-            began_ns = stage_ns()
-            work(turn % FRAMES)
-            took_ms = (stage_ns() - began_ns) / NS_PER_MS
-            # The first two rounds compile and warm up.
-            if turn >= 2:
-                spent_ms[name].append(took_ms)
-                if name == "process":
-                    spent_ms["robot layer"].append(pipeline.last.expected_ns / NS_PER_MS)
-    median = {name: float(np.median(times)) for name, times in spent_ms.items()}
-    rows = [(name, value, float(np.percentile(spent_ms[name], 99))) for name, value in median.items()]
-    print(f"1280x720, UR3, {VOXEL_M * 1e3:g} mm voxels, one thread, {rounds} rounds in turns")
-    print("\n".join(table(("what", "median ms", "p99 ms"), rows)))
-    share = float(np.mean([pipeline.foreground(frames.depth[n], frames.joints[n]).mean() for n in range(FRAMES)]))
-    grid = costs_by_size()
-    result: dict[str, Any] = {
-        "process_ms": median["process"],
-        "vs_open3d": median["open3d"] / median["process"],
-        "vs_octomap": median["octomap"] / median["process"],
-        "filter_vs_memcpy": filter_ms(frames.depth, frames.joints, pipeline, rounds) / median["memcpy"],
-        "expected_depth_vs_embree": median["embree"] / median["robot layer"],
-        "full_expected_depth_vs_embree": median["embree"] / median["expected depth"],
-        "worst_case_ms": median["worst case"],
-        "worst_case_vs_open3d": median["open3d, all points at 20 mm"] / median["worst case"],
-        "foreground_share": share,
-        "process_ms_by_size": grid,
-    }
-    ratio = max(costs["0.01"] / costs["0.05"] for costs in grid.values())
-    marks = [
-        Mark("process, times faster than Open3D", result["vs_open3d"], at_least=30.0),
-        Mark("process, times faster than OctoMap", result["vs_octomap"], at_least=30.0),
-        Mark("robot layer of a frame, times faster than Embree", result["expected_depth_vs_embree"], at_least=30.0),
-        Mark("filter, in memcpys of two images", result["filter_vs_memcpy"], at_most=4.0),
-        Mark("worst case, times faster than Open3D", result["worst_case_vs_open3d"], at_least=8.0),
-        Mark("10 mm voxels, in costs of 50 mm", ratio, at_most=2.0),
-    ]
-    return result, marks
-
-
-def filter_ms(depth: Any, joints: Any, pipeline: Any, rounds: int) -> float:
-    """Median of the filter stage by itself, in ms: the robot stands still, so that nothing is drawn."""
-    times = []
-    for _ in range(rounds + 2):
-        pipeline.foreground(depth[0], joints[0])
-        began_ns = stage_ns()
-        pipeline.foreground(depth[0], joints[0])
-        times.append((stage_ns() - began_ns) / NS_PER_MS)
-    return float(np.median(times[2:]))
-
-
-def costs_by_size() -> dict[str, dict[str, float]]:
-    """Milliseconds of `process` by resolution and voxel size, on the same frames."""
-    grid: dict[str, dict[str, float]] = {}
-    for width, height in RESOLUTIONS:
-        frames = record(width, height, FRAMES)
-        pipelines = {size: frames.pipeline(size) for size in VOXEL_SIZES_M}
-        times: dict[float, list[float]] = {size: [] for size in VOXEL_SIZES_M}
-        for turn in range(TABLE_ROUNDS + 2):
-            n = turn % FRAMES
-            for size, pipeline in pipelines.items():
-                began_ns = stage_ns()
-                pipeline.process(frames.depth[n], frames.joints[n])
-                if turn >= 2:
-                    times[size].append((stage_ns() - began_ns) / NS_PER_MS)
-        grid[f"{width}x{height}"] = {str(size): float(np.median(spent)) for size, spent in times.items()}
-    print("process(), median ms, by resolution and voxel size (m)")
-    rows: list[tuple[str | float, ...]] = [(name, *costs.values()) for name, costs in grid.items()]
-    print("\n".join(table(("resolution", *map(str, VOXEL_SIZES_M)), rows)))
-    return grid
+    marks += more
+    print("\n".join(map(str, marks)))
+    document = figures | sizes | {"machine": machine(), "marks": [mark.document() for mark in marks]}
+    document["passed"] = all(mark.met for mark in marks)
+    write("pipeline", document, options.results)
+    print(line(document))
+    return 0 if document["passed"] else 1
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="make bench-pipeline", description="What a frame costs, beside its peers.")
-    parser.add_argument("--rounds", type=int, default=40, help="in turns; the median counts")
+    parser.add_argument("--turns", type=int, default=25, help=f"of {FRAMES_A_TURN} frames each; the median counts (25)")
     parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for pipeline.json")
     return parser
 

@@ -47,6 +47,7 @@ class RobotLayer:
     """The padded robot, as the band of raw depths that belongs to it.
 
     Attributes:
+        padding_m: (L,) float32, what the links are usually drawn with.
         near_raw, span_raw: (H, W) uint16, the band's lower end and its length.
         columns: (H, 2) int32, of each row the first column and the one after the last that may have a band.
     """
@@ -58,6 +59,7 @@ class RobotLayer:
         hulls = [hull_around(link.mesh, self._hull_m) for link in robot.links] if robot else []
         self._drawing = LinkDrawing(intrinsics, hulls, inflate=True)
         self._is_shown = False
+        self.padding_m = np.full(len(hulls), padding_m, np.float32)
         self.near_raw = np.full(intrinsics.shape, limits.RAW_MAX, np.uint16)
         self.span_raw = np.zeros(intrinsics.shape, np.uint16)
         self.columns = np.zeros((intrinsics.height, 2), np.int32)

@@ -277,15 +277,16 @@ class DepthPipeline:
             return
         settings = self.settings
         T_camera_link = self._links.place(joints)
-        padding_m = np.full(len(T_camera_link), settings.robot_padding_m, np.float32)
+        padding_m, most_m = self._robot.padding_m, settings.robot_padding_m
         if uncertainty is not None:
-            padding_m += self._links.displacement_m(uncertainty)
+            padding_m = (padding_m + self._links.displacement_m(uncertainty)).astype(np.float32)
+            most_m = float(padding_m.max(initial=0.0))
         self._robot.draw(
             T_camera_link,
             padding_m,
             settings.margin_noise_gain * self._noise_per_m,
             # The padded surface stands before the true one by the padding.
-            settings.robot_depth_m + float(padding_m.max(initial=0.0)),
+            settings.robot_depth_m + most_m,
             hidden,
         )
 

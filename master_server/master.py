@@ -86,9 +86,7 @@ class Master:
             Refusal: it speaks another contract, its camera reports from elsewhere, or there are too many units.
         """
         if request.contract != CONTRACT_VERSION:
-            raise Refusal(
-                400, f"contract: this master speaks version {CONTRACT_VERSION}, the unit {request.contract}"
-            )
+            raise Refusal(400, f"contract: this master speaks version {CONTRACT_VERSION}, the unit {request.contract}")
         slot, retired = self.registry.initialize(request, ip, now_ns, self.settings.stale_after_s)
         for gone in (slot, *retired):
             self._withdraw(gone.id)

@@ -141,9 +141,12 @@ def robot_band_raw(
     depth = np.float32(depth_m)
     units = np.float32(1.0 / depth_scale_m)
     for y in range(len(near_raw)):
-        first, end = span_of_row(y, rectangles, links, links)
-        empty_row(near_raw[y], span_raw[y], columns[y, 0], min(columns[y, 1], first))
-        empty_row(near_raw[y], span_raw[y], max(columns[y, 0], end), columns[y, 1])
+        first, end = 0, 0
+        if window[0] <= y < window[0] + window[2]:
+            first, end = span_of_row(y, rectangles, links, links)
+        if columns[y, 0] < columns[y, 1]:
+            empty_row(near_raw[y], span_raw[y], columns[y, 0], min(columns[y, 1], first))
+            empty_row(near_raw[y], span_raw[y], max(columns[y, 0], end), columns[y, 1])
         columns[y, 0], columns[y, 1] = first, end
         if first < end:
             at = (y - window[0]) * window[3] - window[1]

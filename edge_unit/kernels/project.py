@@ -34,11 +34,8 @@ def place_vertices(
     u_px: NDArray[np.float32],
     v_px: NDArray[np.float32],
     w_per_m: NDArray[np.float32],
-    camera_x_m: NDArray[np.float32],
-    camera_y_m: NDArray[np.float32],
-    camera_z_m: NDArray[np.float32],
 ) -> int:
-    """Vertices to the camera frame and to the screen; returns how many lie before the near plane.
+    """Vertices to the screen; returns how many lie before the near plane.
 
     Written for the vectoriser: one type, no branch, each coordinate in its own array.
     """
@@ -60,11 +57,39 @@ def place_vertices(
         u_px[i] = np.rint((x * w * fx + cx) * SUBPIXELS) * SUBPIXEL
         v_px[i] = np.rint((y * w * fy + cy) * SUBPIXELS) * SUBPIXEL
         w_per_m[i] = w
-        camera_x_m[i] = x
-        camera_y_m[i] = y
-        camera_z_m[i] = z
         before += z < near_m
     return before
+
+
+@kernel
+def bring_vertices(
+    x_m: NDArray[np.float32],
+    y_m: NDArray[np.float32],
+    z_m: NDArray[np.float32],
+    offset_x: NDArray[np.float32],
+    offset_y: NDArray[np.float32],
+    offset_z: NDArray[np.float32],
+    padding_m: np.float32,
+    T_camera_mesh: NDArray[np.float64],
+    camera_x_m: NDArray[np.float32],
+    camera_y_m: NDArray[np.float32],
+    camera_z_m: NDArray[np.float32],
+) -> None:
+    """Vertices to the camera frame, reckoned as `place_vertices` does: only a mesh that is cut needs them there."""
+    t = T_camera_mesh
+    for i in range(len(x_m)):
+        px = x_m[i] + padding_m * offset_x[i]
+        py = y_m[i] + padding_m * offset_y[i]
+        pz = z_m[i] + padding_m * offset_z[i]
+        camera_x_m[i] = (
+            np.float32(t[0, 0]) * px + np.float32(t[0, 1]) * py + np.float32(t[0, 2]) * pz + np.float32(t[0, 3])
+        )
+        camera_y_m[i] = (
+            np.float32(t[1, 0]) * px + np.float32(t[1, 1]) * py + np.float32(t[1, 2]) * pz + np.float32(t[1, 3])
+        )
+        camera_z_m[i] = (
+            np.float32(t[2, 0]) * px + np.float32(t[2, 1]) * py + np.float32(t[2, 2]) * pz + np.float32(t[2, 3])
+        )
 
 
 @kernel
@@ -187,28 +212,34 @@ def place_meshes(
     `vertex_starts[m]:vertex_starts[m + 1]` and likewise faces, whose indices count from the mesh's own first vertex.
     A vertex is placed at `vertex + padding_m[m] * offset`, with `offsets` (3, V). `T_camera_mesh` (M, 4, 4).
 
-    Out: `placed` (6, V), pixel coordinates, inverse depth, and the camera's coordinates; `before` (M,), how many of the
-    vertices lie before the near plane; `rectangles` (M, 4), the pixels that a mesh may touch: first and last row, first
-    and last column, empty (first > last) where it is not in view. Scratch: `corners` (3, 3), `polygon` (4, 3).
+    Out: `placed` (6, V), pixel coordinates, inverse depth, and, of a mesh that the near plane cuts, coordinates in the
+    camera frame; `before` (M,), how many of the vertices lie before the near plane; `rectangles` (M, 4), the pixels
+    that a mesh may touch: first and last row, first and last column, empty (first > last) where it is not in view.
+    Scratch: `corners` (3, 3), `polygon` (4, 3).
     """
     for m in range(len(chosen)):
         if not chosen[m]:
             continue
         first, end = vertex_starts[m], vertex_starts[m + 1]
-        u_px, v_px = placed[0, first:end], placed[1, first:end]
-        x_m, y_m, z_m = placed[3, first:end], placed[4, first:end], placed[5, first:end]
+        x_m, y_m, z_m = vertices_m[0, first:end], vertices_m[1, first:end], vertices_m[2, first:end]
+        # Where nothing is added, nothing need be fetched from memory: any numbers that are there will do.
+        added = offsets if padding_m[m] != 0.0 else vertices_m
+        offset_x, offset_y, offset_z = added[0, first:end], added[1, first:end], added[2, first:end]
+        u_px, v_px, w_per_m = placed[0, first:end], placed[1, first:end], placed[2, first:end]
         before[m] = place_vertices(
-            vertices_m[0, first:end], vertices_m[1, first:end], vertices_m[2, first:end],
-            offsets[0, first:end], offsets[1, first:end], offsets[2, first:end],
-            padding_m[m], T_camera_mesh[m], camera,
-            u_px, v_px, placed[2, first:end], x_m, y_m, z_m,
+            x_m, y_m, z_m, offset_x, offset_y, offset_z, padding_m[m], T_camera_mesh[m], camera, u_px, v_px, w_per_m
         )  # fmt: skip
         if before[m] == 0:
             bound(u_px, v_px, width, height, rectangles[m])
         else:
+            camera_x_m, camera_y_m, camera_z_m = placed[3, first:end], placed[4, first:end], placed[5, first:end]
+            bring_vertices(
+                x_m, y_m, z_m, offset_x, offset_y, offset_z, padding_m[m], T_camera_mesh[m],
+                camera_x_m, camera_y_m, camera_z_m,
+            )  # fmt: skip
             a, b, c = faces[0], faces[1], faces[2]
             start, stop = face_starts[m], face_starts[m + 1]
             bound_cut(
-                a[start:stop], b[start:stop], c[start:stop], x_m, y_m, z_m,
+                a[start:stop], b[start:stop], c[start:stop], camera_x_m, camera_y_m, camera_z_m,
                 camera, width, height, corners, polygon, rectangles[m],
             )  # fmt: skip

@@ -331,7 +331,10 @@ def fill_mesh(
     for n in range(larges):
         f = lists[2, n]
         i, j, k = a[f], b[f], c[f]
-        if z_m[i] >= near_m and z_m[j] >= near_m and z_m[k] >= near_m:
+        if before > 0 and (z_m[i] < near_m or z_m[j] < near_m or z_m[k] < near_m):
+            corners_of(i, j, k, x_m, y_m, z_m, corners)
+            fill_clipped(corners, polygon, closed, camera, width, height, window, nearest_w, farthest_w)
+        else:
             # In float64 as after clipping, so that neighbours agree on where their edge crosses a row.
             fill_triangle(
                 np.float64(u_px[i]), np.float64(v_px[i]), np.float64(w_per_m[i]),
@@ -339,9 +342,6 @@ def fill_mesh(
                 np.float64(u_px[k]), np.float64(v_px[k]), np.float64(w_per_m[k]),
                 width, height, window, nearest_w, farthest_w,
             )  # fmt: skip
-        else:
-            corners_of(i, j, k, x_m, y_m, z_m, corners)
-            fill_clipped(corners, polygon, closed, camera, width, height, window, nearest_w, farthest_w)
 
 
 @kernel

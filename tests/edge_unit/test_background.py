@@ -46,9 +46,7 @@ def test_a_background_comes_back(tmp_path: Path, reference: Reference) -> None:
         Place(CAMERA, from_xyz_rpy((1.0, 2.0, 3.001), (0.1, 0.2, 0.3))),
     ],
 )
-def test_that_of_another_camera_profile_or_pose_is_not_used(
-    tmp_path: Path, reference: Reference, other: Place
-) -> None:
+def test_that_of_another_camera_profile_or_pose_is_not_used(tmp_path: Path, reference: Reference, other: Place) -> None:
     store = BackgroundStore(tmp_path)
     store.save(PLACE, reference)
     assert store.load(other) is None

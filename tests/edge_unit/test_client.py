@@ -85,9 +85,7 @@ async def test_the_token_is_read_anew_when_asked() -> None:
         seen.append(request.headers["authorization"])
         return httpx.Response(404, text="gone")
 
-    async with MasterClient(
-        "http://master:1", lambda: next(tokens), transport=httpx.MockTransport(handler)
-    ) as client:
+    async with MasterClient("http://master:1", lambda: next(tokens), transport=httpx.MockTransport(handler)) as client:
         for _ in range(2):
             with pytest.raises(MasterRefused):
                 await client.update(update())

@@ -107,9 +107,7 @@ def test_a_wrong_token_is_refused_until_it_is_right(cluster: Cluster) -> None:
     cluster.start_master()
     token_file = cluster.folder / "token"
     token_file.write_text("not-the-token-of-this-master")
-    unit = cluster.start_unit(
-        1, source(cluster), T_world_camera=LOOKING_ALONG_Y, token_file=str(token_file)
-    )
+    unit = cluster.start_unit(1, source(cluster), T_world_camera=LOOKING_ALONG_Y, token_file=str(token_file))
     until(lambda: "401: unknown token" in cluster.log("unit1"), "the refusal in the log")
     assert cluster.get("/units") == []
     assert "not-the-token" not in cluster.log("unit1") + cluster.log("master")
@@ -167,9 +165,7 @@ def test_background_is_learned_on_request_and_dropped_again(cluster: Cluster) ->
         ({"fsp_max": 3}, "fsp_max"),
     ],
 )
-def test_a_unit_that_cannot_start_says_why_in_one_line(
-    cluster: Cluster, config: dict[str, Any], words: str
-) -> None:
+def test_a_unit_that_cannot_start_says_why_in_one_line(cluster: Cluster, config: dict[str, Any], words: str) -> None:
     token_file = cluster.folder / "token"
     token_file.write_text("some-token-0123456789")
     unit = cluster.start_unit(1, **{"source": source(cluster), "token_file": str(token_file), **config})

@@ -20,6 +20,7 @@ import numpy as np
 
 from benchmarks.report import RESULTS, Mark, line, table, write
 from benchmarks.ur3_scene import Recording, record
+from edge_unit.pipeline import DepthPipeline
 from shared.clock import NS_PER_MS, stage_ns
 from shared.errors import CellwatchError
 
@@ -170,11 +171,7 @@ def costs_by_size(recordings: Sequence[Recording], turns: int) -> tuple[dict[str
     costs: dict[str, dict[str, float]] = {}
     for frames in recordings:
         pipelines = {f"{size * 1e3:g} mm": frames.pipeline(size) for size in VOXEL_SIZES_M}
-        works: dict[str, Work] = {
-            name: lambda n, each=each, frames=frames: each.process(frames.depth[n], frames.joints[n])
-            for name, each in pipelines.items()
-        }  # fmt: skip
-        spent = in_turns(works, turns, len(frames.depth))
+        spent = in_turns({name: _work(each, frames) for name, each in pipelines.items()}, turns, len(frames.depth))
         size = f"{frames.intrinsics.width}x{frames.intrinsics.height}"
         costs[size] = {name: each.median for name, each in spent.items()}
     print("process(), median ms by resolution and voxel size, 10 % of the pixels foreground")
@@ -182,6 +179,10 @@ def costs_by_size(recordings: Sequence[Recording], turns: int) -> tuple[dict[str
     print("\n".join(table(("", *next(iter(costs.values()))), rows)), flush=True)
     ratio = max(each["10 mm"] / each["50 mm"] for each in costs.values())
     return {"process_ms_by_size": costs}, [Mark("10 mm voxels, in costs of 50 mm", ratio, at_most=2.0)]
+
+
+def _work(pipeline: DepthPipeline, frames: Recording) -> Work:
+    return lambda n: pipeline.process(frames.depth[n], frames.joints[n])
 
 
 def single_thread() -> None:

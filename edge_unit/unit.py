@@ -36,7 +36,7 @@ from edge_unit.trace import Trace, TraceRecord
 from edge_unit.uplink import Assignment, Report, Uplink
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.errors import InputError, SourceError
-from shared.messages import MAX_TEXT, MAX_VOXELS, Command, Health
+from shared.messages import DONE, MAX_TEXT, MAX_VOXELS, Command, Health
 from shared.settings import FilterSettings
 from shared.transforms import Transform
 from shared.wire import keys_to_bytes
@@ -52,6 +52,12 @@ REOPEN_MAX_S = 5.0
 
 DRAIN_S = 2.0
 """For the last frame of a recording to reach the master."""
+
+CANNOT = {
+    "calibrate": "this unit cannot look for the calibration board",
+    "refine": "this unit cannot refine its pose by the CAD",
+}
+"""What is asked of units that they are not able to do, in words for the operator."""
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
@@ -201,6 +207,8 @@ class Unit:
             return
         if assignment.T_world_camera is None:
             self._pipeline = None
+            for command in self._take_commands():
+                self.uplink.finish(command, CANNOT.get(command.verb, "the pose of its camera is not known yet"))
             self.uplink.offer(Report(assignment, frame.captured_at_ns, health=Health(frame=frame.frame_number)))
             return
         joints = await self._joints_at(assignment, frame)
@@ -246,7 +254,12 @@ class Unit:
         if self._trace is not None:
             self._trace.flush()
         try:
-            pipeline = self._prepared(assignment, T_world_camera)
+            try:
+                pipeline = self._prepared(assignment, T_world_camera)
+            except InputError as error:
+                for command in commands:
+                    self.uplink.finish(command, str(error))
+                raise
             for command in commands:
                 self._obey(command, pipeline)
             if self._learning is not None:
@@ -279,7 +292,7 @@ class Unit:
 
     def _find_background(self, pipeline: DepthPipeline) -> None:
         """What was learned at this place before, or else begin to learn if the configuration says so."""
-        self._learning = None
+        self._end_learning("the camera's pose changed meanwhile")
         stored = self._store.load(self._place(pipeline))
         if stored is not None:
             logger.info("using the background learned before, from %d frames", stored.frames)
@@ -288,15 +301,25 @@ class Unit:
             self._learning = _Learning(pipeline.learner(), self._config.learn_background_frames, None)
 
     def _obey(self, command: Command, pipeline: DepthPipeline) -> None:
+        """Do what was asked; what takes more than one frame only begins here."""
         if command.verb == "learn_background":
             frames = self._config.learn_background_frames or LEARN_FRAMES
+            self._end_learning("it was asked to begin anew")
             pipeline.use(None)
             self._learning = _Learning(pipeline.learner(), frames, command)
-        else:
-            self._learning = None
+        elif command.verb == "drop_background":
+            self._end_learning("it was asked to drop the background")
             pipeline.use(None)
             self._store.drop()
             self.uplink.finish(command)
+        else:
+            self.uplink.finish(command, CANNOT.get(command.verb, f"this unit does not know how to {command.verb}"))
+
+    def _end_learning(self, outcome: str) -> None:
+        """Learn no more; whoever asked for it is told the `outcome`."""
+        if self._learning is not None and self._learning.command is not None:
+            self.uplink.finish(self._learning.command, outcome)
+        self._learning = None
 
     def _learn(
         self,
@@ -316,9 +339,7 @@ class Unit:
         reference = learning.learner.reference()
         pipeline.use(reference)
         self._store.save(self._place(pipeline), reference)
-        if learning.command is not None:
-            self.uplink.finish(learning.command)
-        self._learning = None
+        self._end_learning(DONE)
         logger.info("learned the background from %d frames: %.0f %% of it", done, 100.0 * reference.learned_share)
         return _report(pipeline, assignment, frame, joints)
 

@@ -24,10 +24,13 @@ from shared.errors import CellwatchError, ConfigError, MasterRefused
 from shared.lattice import Lattice
 from shared.messages import (
     CONTRACT_VERSION,
+    DONE,
     MAX_COMMANDS,
+    MAX_TEXT,
     Command,
     Health,
     InitializeRequest,
+    Outcome,
     SeenReport,
     UpdateAnswer,
     UpdateRequest,
@@ -106,7 +109,7 @@ class Uplink:
         self._acknowledged: tuple[Versions, bytes] | None = None
         self._id = 0
         self._sequence = 0
-        self._done: list[int] = []
+        self._done: list[Outcome] = []
         self._open_commands: dict[int, Command] = {}
         self.assignment: Assignment | None = None
         self.assigned = asyncio.Event()
@@ -140,10 +143,10 @@ class Uplink:
         self._idle.clear()
         self._wake.set()
 
-    def finish(self, command: Command) -> None:
-        """A command was carried out; the master is told with the next update."""
+    def finish(self, command: Command, outcome: str = DONE) -> None:
+        """A command came to an end: carried out, or why not; the master is told with the next update."""
         if command.id in self._open_commands:
-            self._done.append(command.id)
+            self._done.append(Outcome(command.id, outcome[:MAX_TEXT]))
 
     async def drained(self, timeout_s: float) -> None:
         """Wait until nothing is left to be sent, but no longer than `timeout_s`."""
@@ -210,6 +213,9 @@ class Uplink:
         self._acknowledged = None
         self._done.clear()
         self._open_commands.clear()
+        # Those of the session before; the master sends again what it still wants.
+        while not self.commands.empty():
+            self.commands.get_nowait()
         cell = await self._cells.get(answer.cell, self._client)
         pose = None if answer.T_world_camera is None else validated(answer.T_world_camera, "T_world_camera")
         versions = answer.versions
@@ -269,7 +275,9 @@ class Uplink:
         done = tuple(self._done[:MAX_COMMANDS])
         health = report.health
         if self.trouble is not None or self.warning is not None:
-            health = health.model_copy(update={"trouble": self.trouble or health.trouble, "warning": self.warning})
+            health = health.model_copy(
+                update={"trouble": self.trouble or health.trouble, "warning": self.warning or health.warning}
+            )
         sent_at_ns = monotonic_ns()
         answer = await self._client.update(
             UpdateRequest(
@@ -320,10 +328,10 @@ class Uplink:
                 self._open_commands[command.id] = command
                 self.commands.put_nowait(command)
 
-    def _forget_commands(self, done: Iterable[int]) -> None:
-        for command_id in done:
-            self._done.remove(command_id)
-            self._open_commands.pop(command_id, None)
+    def _forget_commands(self, done: Iterable[Outcome]) -> None:
+        for outcome in done:
+            self._done.remove(outcome)
+            self._open_commands.pop(outcome.id, None)
 
     def _assign(self, assignment: Assignment) -> None:
         self.assignment = assignment

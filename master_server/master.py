@@ -36,6 +36,7 @@ from shared.messages import (
     UnitRow,
     UpdateAnswer,
     UpdateRequest,
+    Verb,
     Versions,
     matrix_of,
 )
@@ -157,13 +158,13 @@ class Master:
         logger.info("unit %d (%s): its pose is set (%s)", slot.id, slot.ip, origin)
         return slot.pose_version
 
-    def ask(self, unit_id: int, verb: str) -> Command:
+    def ask(self, unit_id: int, verb: Verb, now_ns: int) -> Command:
         """Have a unit do something.
 
         Raises:
             Refusal: 404, there is none; 409, too much waits for it.
         """
-        return self.registry.ask(self.registry.get(unit_id), verb)
+        return self.registry.ask(self.registry.get(unit_id), verb, now_ns)
 
     # ------------------------------------------------------------------ what everyone asks
 
@@ -280,9 +281,10 @@ class Master:
         if update.captured_at_ns != slot.captured_at_ns and update.captured_at_ns is not None:
             slot.captures_ns.append(update.captured_at_ns)
         slot.captured_at_ns = update.captured_at_ns
-        if update.done:
-            for command in [command for command in slot.commands if command.id in update.done]:
-                slot.commands.remove(command)
+        for outcome in update.done:
+            slot.end(outcome)
+        if slot.asked:
+            slot.expire(now_ns)
 
     def _answer(self, slot: Slot, update: UpdateRequest, now_ns: int) -> UpdateAnswer:
         current, theirs = self._versions_for(slot), update.versions
@@ -291,7 +293,7 @@ class Master:
             received_at_ns=now_ns,
             answered_at_ns=now_ns,
             joints=self.robot.since(update.joints_until_ns),
-            commands=tuple(slot.commands),
+            commands=slot.commands,
         )
         if current == theirs:
             return answer

@@ -15,7 +15,20 @@ from numpy.typing import NDArray
 from master_server.merge import MAX_WITNESSES, NO_KEYS
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.errors import Refusal
-from shared.messages import MAX_COMMANDS, Command, Health, InitializeRequest, Matrix, State, UnitRow, Versions
+from shared.messages import (
+    MAX_COMMANDS,
+    Command,
+    CommandRow,
+    Health,
+    ImageKind,
+    InitializeRequest,
+    Matrix,
+    Outcome,
+    State,
+    UnitRow,
+    Verb,
+    Versions,
+)
 from shared.settings import Settings
 from shared.timebase import ClockOffset
 
@@ -41,6 +54,20 @@ MOVED_AGREEING_SHARE = 0.1
 MOVED_STATIC_SHARE = 0.1
 """With fewer pixels before known surfaces there is nothing to tell a moved camera by."""
 
+COMMAND_EXPIRES_S = 600.0
+"""Learning the background at one frame a second takes minutes; what is not answered after ten of them never will be."""
+
+IMAGE_EXPIRES_S = 5.0
+"""The unit needs one frame and one update for it; whoever waits in front of a browser has lost patience by then."""
+
+
+@dataclass
+class _Asked:
+    """A command that the unit has not answered yet."""
+
+    command: Command
+    expires_at_ns: int
+
 
 @dataclass
 class Slot:
@@ -64,7 +91,8 @@ class Slot:
     T_world_camera: Matrix | None = None
     pose_version: int = 0
     note: str = ""
-    commands: deque[Command] = field(default_factory=deque)
+    asked: deque[_Asked] = field(default_factory=deque)
+    last_command: CommandRow | None = None
 
     def set_pose(self, T_world_camera: Matrix | None, note: str = "") -> None:
         """The camera is elsewhere from now on, or nobody knows where; `note` tells why."""
@@ -72,6 +100,27 @@ class Slot:
         self.pose_version += 1
         self.note = note
         self.keys = NO_KEYS
+
+    @property
+    def commands(self) -> tuple[Command, ...]:
+        """What the unit was asked and did not answer yet, the oldest first."""
+        return tuple(asked.command for asked in self.asked)
+
+    def expire(self, now_ns: int) -> None:
+        """Give up what the unit did not answer in its time."""
+        for asked in [asked for asked in self.asked if asked.expires_at_ns <= now_ns]:
+            limit_s = IMAGE_EXPIRES_S if asked.command.verb == "image" else COMMAND_EXPIRES_S
+            self.end(Outcome(asked.command.id, f"the unit did not answer within {limit_s:g} s"))
+
+    def end(self, outcome: Outcome) -> None:
+        """A command came to an end; harmless when it had before."""
+        for asked in [asked for asked in self.asked if asked.command.id == outcome.id]:
+            self.asked.remove(asked)
+            verb = asked.command.verb
+            level = logging.DEBUG if verb == "image" else logging.INFO
+            logger.log(level, "unit %d (%s): command %d, %s: %s", self.id, self.ip, outcome.id, verb, outcome.text)
+            if self.last_command is not None and self.last_command.id == outcome.id:
+                self.last_command = self.last_command.model_copy(update={"outcome": outcome.text})
 
     def age_s(self, now_ns: int) -> float | None:
         """Seconds from the last frame's capture to the master's `now_ns`; None while it cannot be told."""
@@ -116,6 +165,7 @@ class Slot:
 
     def row(self, now_ns: int, state: State, reason: str) -> UnitRow:
         """What `GET /units` tells."""
+        self.expire(now_ns)
         age_s, arrival_age_s = self.age_s(now_ns), self.arrival_age_s(now_ns)
         uncertainty_ns = self.clock_uncertainty_ns(now_ns)
         return UnitRow(
@@ -136,6 +186,7 @@ class Slot:
             health=self.health,
             T_world_camera=self.T_world_camera,
             versions=self.versions,
+            last_command=self.last_command,
         )
 
     def _stale(self, now_ns: int, current: Versions, settings: Settings) -> str:
@@ -258,15 +309,19 @@ class Registry:
         slot = self.get(unit_id)
         del self._slots[unit_id], self._by_ip[slot.ip]
 
-    def ask(self, slot: Slot, verb: str) -> Command:
+    def ask(self, slot: Slot, verb: Verb, now_ns: int, image: ImageKind | None = None, raw: bool = False) -> Command:
         """Have a unit do something; it learns of it with the answer to its next update.
 
         Raises:
             Refusal: 409, too many commands wait for it already.
         """
-        if len(slot.commands) >= MAX_COMMANDS:
+        slot.expire(now_ns)
+        if len(slot.asked) >= MAX_COMMANDS:
             raise Refusal(409, f"unit {slot.id}: {MAX_COMMANDS} commands wait for it already")
         self._last_command += 1
-        command = Command.model_validate({"id": self._last_command, "verb": verb})
-        slot.commands.append(command)
+        command = Command(id=self._last_command, verb=verb, image=image, raw=raw)
+        expires_s = IMAGE_EXPIRES_S if verb == "image" else COMMAND_EXPIRES_S
+        slot.asked.append(_Asked(command, now_ns + round(expires_s * NS_PER_S)))
+        if verb != "image":
+            slot.last_command = CommandRow(id=command.id, verb=verb, outcome=None)
         return command

@@ -18,7 +18,7 @@ from shared.settings import Settings
 from shared.timebase import Exchange
 from shared.transforms import Transform, validated
 
-CONTRACT_VERSION = 1
+CONTRACT_VERSION = 2
 """Rises when a unit of the old contract and a master of the new one can no longer work together."""
 
 MAX_TEXT = 200
@@ -38,6 +38,9 @@ MAX_SEEN_BYTES = 4096
 
 MAX_COMMANDS = 16
 """Pending for one unit; an operator who clicks on is told to wait."""
+
+DONE = "done"
+"""The outcome of a command that was carried out; any other is a sentence that says why it was not."""
 
 MAX_JOINT_SAMPLES = 32
 """In one answer: a slow unit at 5 fps gets all that it needs at one sample in 8 ms."""
@@ -65,6 +68,8 @@ Matrix = tuple[
     tuple[float, float, float, float],
 ]
 State = Literal["uncalibrated", "live", "stale", "blind", "moved"]
+Verb = Literal["learn_background", "drop_background", "calibrate", "refine", "image"]
+ImageKind = Literal["depth", "expected", "foreground"]
 
 
 class Message(BaseModel):
@@ -119,10 +124,19 @@ class JointSample(NamedTuple):
 
 
 class Command(Message):
-    """Something that an operator asked a unit to do; the unit names the `id` in a later update when it is done."""
+    """Something that a unit is asked to do; it tells the outcome under the same `id` in a later update."""
 
     id: Counter
-    verb: Literal["learn_background", "drop_background"]
+    verb: Verb
+    image: ImageKind | None = Field(default=None, description="With the verb `image`: which one.")
+    raw: bool = Field(default=False, description="With the verb `image`: 16 bits in units of depth_scale, no colours.")
+
+
+class Outcome(NamedTuple):
+    """What became of a command: `DONE`, or why it was not carried out."""
+
+    id: Counter
+    text: Text
 
 
 class InitializeRequest(Message):
@@ -199,7 +213,7 @@ class UpdateRequest(Message):
     seen: SeenReport | None = Field(default=None, description="Absent: as it was in the update before.")
     health: Health = Health()
     joints_until_ns: Nanoseconds = Field(default=0, description="The newest joints that the unit has.")
-    done: tuple[Counter, ...] = Field(default=(), max_length=MAX_COMMANDS)
+    done: tuple[Outcome, ...] = Field(default=(), max_length=MAX_COMMANDS, description="Commands that came to an end.")
 
 
 class UpdateAnswer(Message):
@@ -254,6 +268,14 @@ class RobotAnswer(Message):
     joints: tuple[JointSample, ...]
 
 
+class CommandRow(Message):
+    """The last thing that an operator asked of a unit."""
+
+    id: Counter
+    verb: Verb
+    outcome: Text | None = Field(description="`done`, or why not; absent while the unit is at it.")
+
+
 class UnitRow(Message):
     """One unit in `GET /units`."""
 
@@ -274,6 +296,7 @@ class UnitRow(Message):
     health: Health
     T_world_camera: Matrix | None
     versions: Versions
+    last_command: CommandRow | None = None
 
 
 class VoxelsAnswer(Message):

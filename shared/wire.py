@@ -38,8 +38,8 @@ from shared.messages import (
 
 MEDIA_TYPE = "application/msgpack"
 
-MAX_FIXED_BYTES = 4096
-"""Of an update without keys and seen report: its numbers, names and one sentence of trouble."""
+MAX_FIXED_BYTES = 2**14
+"""Of an update without keys and seen report: its numbers and names, and a sentence for each of MAX_COMMANDS."""
 
 MAX_UPDATE_BYTES = 4 * MAX_VOXELS + MAX_SEEN_BYTES + MAX_FIXED_BYTES
 

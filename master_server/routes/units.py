@@ -59,11 +59,23 @@ async def set_pose(
 
 @router.post("/units/{unit_id}/background", dependencies=OPERATOR_ONLY, status_code=202)
 async def learn_background(unit_id: UnitId, master: MasterDependency) -> Command:
-    """Have a unit learn the empty cell; nobody should be in it."""
-    return master.ask(unit_id, "learn_background")
+    """Have a unit learn the empty cell; nobody should be in it. `GET /units` tells what became of it."""
+    return master.ask(unit_id, "learn_background", monotonic_ns())
 
 
 @router.delete("/units/{unit_id}/background", dependencies=OPERATOR_ONLY, status_code=202)
 async def drop_background(unit_id: UnitId, master: MasterDependency) -> Command:
     """Have a unit forget what it learned of the empty cell."""
-    return master.ask(unit_id, "drop_background")
+    return master.ask(unit_id, "drop_background", monotonic_ns())
+
+
+@router.post("/units/{unit_id}/calibrate", dependencies=OPERATOR_ONLY, status_code=202)
+async def calibrate(unit_id: UnitId, master: MasterDependency) -> Command:
+    """Have a unit look for the calibration board again. `GET /units` tells what became of it."""
+    return master.ask(unit_id, "calibrate", monotonic_ns())
+
+
+@router.post("/units/{unit_id}/refine", dependencies=OPERATOR_ONLY, status_code=202)
+async def refine(unit_id: UnitId, master: MasterDependency) -> Command:
+    """Have a unit refine its camera's pose by the CAD that it sees. `GET /units` tells what became of it."""
+    return master.ask(unit_id, "refine", monotonic_ns())

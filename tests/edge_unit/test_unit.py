@@ -25,10 +25,11 @@ from edge_unit.unit import Unit
 from master_server.access import Access
 from master_server.app import make_app
 from master_server.master import Master
+from master_server.registry import Slot
 from shared.camera import Intrinsics
 from shared.clock import monotonic_ns
 from shared.errors import SourceError
-from shared.messages import JointsRequest, UnitRow
+from shared.messages import DONE, CommandRow, JointsRequest, Outcome, UnitRow, Verb
 from tests.master_server.fakes import master as make_master
 
 TOKEN = "unit-token-0123456789"
@@ -331,11 +332,57 @@ async def test_the_background_is_learned_kept_and_used_again(tmp_path: Path) -> 
         bench.show(patch(1225))
         await bench.until(lambda: (row := bench.row()) and row.frame_number == 5, "the next frame")
         assert bench.voxels() == set()
-        command = bench.master.ask(1, "drop_background")
+        command = bench.master.ask(1, "drop_background", monotonic_ns())
         await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
         bench.show(patch(1225))
         await bench.until(bench.voxels, "no background")
-        await bench.until(lambda: not bench.master.registry.get(1).commands, f"{command} done")
+        done = CommandRow(id=command.id, verb="drop_background", outcome=DONE)
+        await bench.until(lambda: (row := bench.row()) and row.last_command == done, f"{command} done")
+
+
+async def outcome_of(bench: Bench, verb: Verb) -> str | None:
+    """What becomes of a command that the next frame answers."""
+    command = bench.master.ask(1, verb, monotonic_ns())
+    await bench.until(lambda: not bench.unit.uplink.commands.empty(), f"{verb} reached the unit")
+    bench.show(patch(1225))
+    row = await bench.until(
+        lambda: (row := bench.row()) and row.last_command and row.last_command.outcome and row, f"outcome of {verb}"
+    )
+    assert isinstance(row, UnitRow)
+    assert row.last_command is not None
+    assert (row.last_command.id, row.last_command.verb) == (command.id, verb)
+    return row.last_command.outcome
+
+
+async def test_what_a_unit_cannot_do_it_says(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path, T_world_camera=None)
+    async with bench.running():
+        await bench.until_state("uncalibrated")
+        assert await outcome_of(bench, "drop_background") == "the pose of its camera is not known yet"
+        bench.master.set_pose(1, _matrix(ABOVE), "operator", None)
+        await bench.until(lambda: bench.unit.uplink.assignment.T_world_camera is not None, "the pose")
+        assert await outcome_of(bench, "refine") == "this unit cannot refine its pose by the CAD"
+        assert await outcome_of(bench, "drop_background") == DONE
+
+
+async def test_who_asked_for_a_background_is_told_when_it_is_given_up(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path)
+    async with bench.running():
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        learn = bench.master.ask(1, "learn_background", monotonic_ns())
+        await bench.until(lambda: not bench.unit.uplink.commands.empty(), "the command")
+        bench.show(patch(1225))
+        row = await bench.until_state("blind")
+        assert row.last_command == CommandRow(id=learn.id, verb="learn_background", outcome=None)
+        ended: list[Outcome] = []
+        with pytest.MonkeyPatch.context() as monkey:
+            monkey.setattr(Slot, "end", lambda slot, outcome: ended.append(outcome))
+            bench.master.ask(1, "drop_background", monotonic_ns())
+            await bench.until(lambda: not bench.unit.uplink.commands.empty(), "the other command")
+            bench.show(patch(1225))
+            await bench.until(lambda: ended, "both outcomes")
+        assert Outcome(learn.id, "it was asked to drop the background") in ended
 
 
 async def test_frames_beyond_the_rate_are_passed_over(tmp_path: Path) -> None:

@@ -287,9 +287,14 @@ async def test_commands_are_carried_out_once_and_told_until_the_master_knows() -
         assert bench.uplink.commands.get_nowait() == command
         assert bench.uplink.commands.empty()
         bench.master.answers = [MasterUnreachable("nobody")]
-        bench.uplink.finish(command)
+        bench.uplink.finish(command, "no board in view")
         before = len(bench.master.updates)
-        await until(lambda: len([update for update in bench.master.updates[before:] if update.done == (5,)]) >= 2)
+        await until(
+            lambda: (
+                len([update for update in bench.master.updates[before:] if update.done == ((5, "no board in view"),)])
+                >= 2
+            )
+        )
         await until(lambda: bench.master.updates[-1].done == ())
 
 

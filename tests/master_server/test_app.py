@@ -156,6 +156,8 @@ DOORS = [
     ("PUT", "/robot/joints", 401, 403, 422),
     ("POST", "/units/1/background", 401, 403, 404),
     ("DELETE", "/units/1/background", 401, 403, 404),
+    ("POST", "/units/1/calibrate", 401, 403, 404),
+    ("POST", "/units/1/refine", 401, 403, 404),
     ("DELETE", "/units/1", 401, 403, 404),
     ("GET", "/healthz", 200, 200, 200),
 ]
@@ -309,14 +311,29 @@ async def test_the_cell_and_its_meshes(desk: Desk) -> None:
     assert "immutable" in mesh.headers["cache-control"]
 
 
-async def test_commands_of_an_operator_reach_the_unit(desk: Desk) -> None:
+@pytest.mark.parametrize(
+    ("method", "what", "verb"),
+    [
+        ("POST", "background", "learn_background"),
+        ("DELETE", "background", "drop_background"),
+        ("POST", "calibrate", "calibrate"),
+        ("POST", "refine", "refine"),
+    ],
+)
+async def test_commands_of_an_operator_reach_the_unit(desk: Desk, method: str, what: str, verb: str) -> None:
     unit = await desk.register()
-    path = f"/units/{unit.initialized.id}/background"
-    asked = await desk.call("POST", path)
+    path = f"/units/{unit.initialized.id}/{what}"
+    assert (await desk.call(method, path, UNIT)).status_code == 403
+    asked = await desk.call(method, path)
     assert asked.status_code == 202
     answer = decode_update_answer((await desk.update(unit)).content)
     assert [command.model_dump() for command in answer.commands] == [asked.json()]
-    assert asked.json()["verb"] == "learn_background"
+    assert asked.json()["verb"] == verb
+    assert (await desk.call("GET", "/units")).json()[0]["last_command"] == {
+        "id": asked.json()["id"],
+        "verb": verb,
+        "outcome": None,
+    }
 
 
 async def test_a_body_beyond_its_bound_is_refused(desk: Desk) -> None:

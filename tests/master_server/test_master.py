@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from master_server.master import Master
-from master_server.registry import FPS_FRAMES, MAX_UNITS
+from master_server.registry import COMMAND_EXPIRES_S, FPS_FRAMES, MAX_UNITS
 from shared.errors import InputError, Refusal, WireError
 from shared.lattice import Lattice
-from shared.messages import MAX_COMMANDS, Health, JointsRequest, Versions
+from shared.messages import CONTRACT_VERSION, DONE, MAX_COMMANDS, CommandRow, Health, JointsRequest, Outcome, Versions
 from shared.timebase import Exchange
 from tests.master_server.fakes import AT_ORIGIN, GOOD, MS, START_NS, FakeUnit, S, joined, master, sees_all
 
@@ -117,8 +117,8 @@ def test_there_is_an_end_to_slots() -> None:
 
 def test_another_contract_is_refused() -> None:
     one = master()
-    with pytest.raises(Refusal, match="version 1, the unit 2"):
-        one.initialize(FakeUnit(one).introduction(NOW_NS, contract=2), "10.0.0.1", NOW_NS)
+    with pytest.raises(Refusal, match=f"version {CONTRACT_VERSION}, the unit {CONTRACT_VERSION + 1}"):
+        one.initialize(FakeUnit(one).introduction(NOW_NS, contract=CONTRACT_VERSION + 1), "10.0.0.1", NOW_NS)
     assert one.units(NOW_NS) == []
 
 
@@ -482,20 +482,38 @@ def test_a_unit_tells_only_its_own_pose(unit_id: int, ip: str | None, status: in
 def test_commands_are_repeated_until_they_are_done() -> None:
     one = master()
     unit = live(one)
-    command = one.ask(unit.initialized.id, "learn_background")
+    command = one.ask(unit.initialized.id, "learn_background", NOW_NS)
     assert unit.update(NOW_NS).commands == (command,)
     assert unit.update(NOW_NS).commands == (command,)
-    assert unit.update(NOW_NS, done=(command.id,)).commands == ()
-    assert unit.update(NOW_NS, done=(command.id,)).commands == ()
+    (row,) = one.units(NOW_NS)
+    assert row.last_command == CommandRow(id=command.id, verb="learn_background", outcome=None)
+    assert unit.update(NOW_NS, done=(Outcome(command.id, DONE),)).commands == ()
+    assert unit.update(NOW_NS, done=(Outcome(command.id, "too late"),)).commands == ()
+    (row,) = one.units(NOW_NS)
+    assert row.last_command == CommandRow(id=command.id, verb="learn_background", outcome=DONE)
 
 
 def test_commands_are_bounded() -> None:
     one = master()
     unit = live(one)
     for _ in range(MAX_COMMANDS):
-        one.ask(unit.initialized.id, "drop_background")
+        one.ask(unit.initialized.id, "drop_background", NOW_NS)
     with pytest.raises(Refusal, match="wait for it already"):
-        one.ask(unit.initialized.id, "drop_background")
+        one.ask(unit.initialized.id, "drop_background", NOW_NS)
+
+
+def test_commands_that_are_never_answered_expire() -> None:
+    one = master()
+    unit = live(one)
+    for _ in range(MAX_COMMANDS):
+        one.ask(unit.initialized.id, "calibrate", NOW_NS)
+    later_ns = NOW_NS + round(COMMAND_EXPIRES_S * S)
+    assert len(unit.update(later_ns - MS).commands) == MAX_COMMANDS
+    (row,) = one.units(later_ns)
+    assert row.last_command is not None
+    assert row.last_command.outcome == "the unit did not answer within 600 s"
+    assert unit.update(later_ns).commands == ()
+    assert one.ask(unit.initialized.id, "calibrate", later_ns).verb == "calibrate"
 
 
 def test_a_unit_gets_the_joints_that_it_lacks() -> None:

@@ -13,12 +13,14 @@ from hypothesis import strategies as st
 
 from shared.errors import InputError, WireError
 from shared.messages import (
+    DONE,
     MAX_SEEN_BYTES,
     MAX_VOXELS,
     Command,
     Health,
     JointSample,
     LatticeDescription,
+    Outcome,
     SeenReport,
     UpdateAnswer,
     UpdateRequest,
@@ -58,7 +60,7 @@ def update(**changes: Any) -> UpdateRequest:
             valid_share=0.87, agreeing_share=0.95, residual_share=-0.01, static_share=0.5, process_ms=8.1, frame=10**7
         ),
         "joints_until_ns": LATE_NS,
-        "done": (3, 4),
+        "done": (Outcome(3, DONE), Outcome(4, "the board is not in view")),
     }
     return UpdateRequest(**{**fields, **changes})
 

@@ -10,7 +10,10 @@ In the order of the flow:
     merge        the units' voxels, merged (Algorithm 9)
     registry     the units' slots and how far each can be trusted (Algorithm 8)
     master       all of that held together, without a network
+    answers      what readers are told of it
+    stream       the map as it changes, for many listeners
     routes/      the same as HTTP
     app          the web application, assembled
+    websocket    a socket that keeps nothing for who does not read
     __main__     the command line
 """

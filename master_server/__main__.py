@@ -21,6 +21,7 @@ from master_server.access import Role, load_access, token_file
 from master_server.app import make_app
 from master_server.config import ENVIRONMENT_PREFIX, MasterConfig
 from master_server.master import Master
+from master_server.websocket import SERVER_OPTIONS
 from shared.cell import Cell
 from shared.configuration import assignments, load
 from shared.errors import CellwatchError, ConfigError
@@ -97,6 +98,7 @@ def _serve(config: MasterConfig) -> None:
             server_header=False,
             date_header=False,
             timeout_graceful_shutdown=STOP_S,
+            **SERVER_OPTIONS,
         ),
         ready,
         config.ready_file,

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
@@ -11,8 +14,9 @@ from starlette.types import Receive, Scope, Send
 
 from master_server.access import Access
 from master_server.master import Master
-from master_server.routes import cell, health, map, robot, units
+from master_server.routes import cell, health, map, robot, stream, units
 from master_server.routes.update import UpdateEndpoint
+from master_server.stream import Stream
 from shared.configuration import sentence_of
 from shared.errors import CellwatchError, InputError, Refusal, WireError
 
@@ -32,6 +36,16 @@ class Application(FastAPI):
 def make_app(master: Master, access: Access) -> Application:
     """The application that serves one master."""
     update = UpdateEndpoint(master, access)
+    listeners = Stream(master)
+
+    @asynccontextmanager
+    async def running(app: FastAPI) -> AsyncIterator[None]:
+        listeners.start()
+        try:
+            yield
+        finally:
+            listeners.stop()
+
     app = Application(
         title="Cellwatch master",
         description=(master.__doc__ or "").splitlines()[0],
@@ -42,11 +56,13 @@ def make_app(master: Master, access: Access) -> Application:
             RequestValidationError: _invalid,
         },
         routes=[Route("/update", update, methods=["POST"])],
+        lifespan=running,
     )
     app.update = update
     app.state.master = master
     app.state.access = access
-    for module in (units, cell, map, robot, health):
+    app.state.stream = listeners
+    for module in (units, cell, map, stream, robot, health):
         app.include_router(module.router)
     return app
 

@@ -7,6 +7,7 @@ Every call is handed the time; nothing here waits, reads a file or knows HTTP.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,6 +76,8 @@ class Master:
         self.versions = Versions(settings=1, lattice=1, cell=1)
         self.registry = Registry()
         self.robot = RobotJoints(cell.robot.joint_names if cell.robot else None)
+        self.listeners: list[Callable[[], None]] = []
+        """Called after each change of what `view` says; time alone changes it too, see `next_change_ns`."""
         self._documents()
         self._begin_on(cell.lattice(settings.voxel_size_m), blocks_of(cell, settings.seen_block_size_m))
 
@@ -91,6 +94,7 @@ class Master:
         slot, retired = self.registry.initialize(request, ip, now_ns, self.settings.stale_after_s)
         for gone in (slot, *retired):
             self._withdraw(gone.id)
+        self._changed()
         return InitializeAnswer(
             id=slot.id,
             session=slot.session,
@@ -126,11 +130,15 @@ class Master:
             self.map.replace(slot.id, keys)
         else:
             self.map.withdraw(slot.id)
+        self._changed()
         return self._answer(slot, update, now_ns)
 
     def judge(self, slot: Slot, now_ns: int) -> tuple[State, str]:
-        """A unit's state now, and why in words."""
-        return slot.judge(now_ns, self.versions, self.settings)
+        """A unit's state now, and why in words; a state other than the last one found is logged."""
+        state, reason = slot.judge(now_ns, self.versions, self.settings)
+        if state != slot.told_state:
+            slot.tell(state, reason)
+        return state, reason
 
     def units(self, now_ns: int) -> list[UnitRow]:
         """One row a unit."""
@@ -144,6 +152,7 @@ class Master:
         """
         self.registry.remove(unit_id)
         self._withdraw(unit_id)
+        self._changed()
 
     def set_pose(self, unit_id: int, T_world_camera: Matrix, origin: str, ip: str | None) -> int:
         """A camera's pose is known, by whatever means; returns its version. `ip` is the caller's, if it is a unit.
@@ -155,7 +164,8 @@ class Master:
         slot = self.registry.get(unit_id) if ip is None else self.registry.own(unit_id, ip)
         slot.set_pose(matrix_of(validated(T_world_camera, "T_world_camera")))
         self._withdraw(slot.id)
-        logger.info("unit %d (%s): its pose is set (%s)", slot.id, slot.ip, origin)
+        self._changed()
+        logger.info("unit %d (%s): its pose is set (%s)", slot.id, slot.ip, origin, extra=slot.log_fields("pose"))
         return slot.pose_version
 
     def ask(self, unit_id: int, verb: Verb, now_ns: int) -> Command:
@@ -202,11 +212,20 @@ class Master:
         """How many live units look through each block, in the shape of `coverage.blocks`."""
         return self.coverage.seen_by(slot.id for slot in self.registry if self.judge(slot, now_ns)[0] == "live")
 
+    def next_change_ns(self, now_ns: int) -> int | None:
+        """The time after which a unit or the robot is stale if it stays silent; the first of them, None without any."""
+        moments = [slot.expires_at_ns(self.settings.stale_after_s) for slot in self.registry]
+        moments.append(self.robot.expires_at_ns(self.settings.robot_stale_after_s))
+        return min((moment for moment in moments if moment is not None and moment >= now_ns), default=None)
+
     # ------------------------------------------------------------------ robot
 
     def put_joints(self, request: JointsRequest, now_ns: int) -> None:
         """The robot tells where it is; raises as `RobotJoints.put`."""
+        was_fresh = self.robot.state(now_ns, self.settings.robot_stale_after_s)[0] == "fresh"
         self.robot.put(request, now_ns)
+        if not was_fresh:
+            self._changed()
 
     def robot_answer(self, since_ns: int | None, now_ns: int) -> RobotAnswer:
         """The newest joints, or all after `since_ns`."""
@@ -249,9 +268,14 @@ class Master:
         )
         if lattice_changes or blocks != self.coverage.blocks:
             self._begin_on(lattice, blocks)
+        self._changed()
         return settings
 
     # ------------------------------------------------------------------ inside
+
+    def _changed(self) -> None:
+        for listener in self.listeners:
+            listener()
 
     def _documents(self) -> None:
         self.cell_document, self.meshes = self.cell.to_document()

@@ -93,6 +93,7 @@ class Slot:
     note: str = ""
     asked: deque[_Asked] = field(default_factory=deque)
     last_command: CommandRow | None = None
+    told_state: State | None = None
 
     def set_pose(self, T_world_camera: Matrix | None, note: str = "") -> None:
         """The camera is elsewhere from now on, or nobody knows where; `note` tells why."""
@@ -131,6 +132,26 @@ class Slot:
     def arrival_age_s(self, now_ns: int) -> float | None:
         """Seconds since an update arrived."""
         return None if self.arrived_at_ns is None else (now_ns - self.arrived_at_ns) / NS_PER_S
+
+    def expires_at_ns(self, stale_after_s: float) -> int | None:
+        """When, by the master's clock, its last view becomes too old; None while it has none."""
+        if self.arrived_at_ns is None or self.captured_at_ns is None or not self.clock.known:
+            return None
+        newest_ns = min(self.arrived_at_ns, self.captured_at_ns + self.clock.offset_ns)
+        return newest_ns + round(stale_after_s * NS_PER_S)
+
+    def tell(self, state: State, reason: str) -> None:
+        """Log that its state is another one."""
+        level = logging.INFO if state == "live" else logging.WARNING
+        before = f"{self.told_state} → " if self.told_state else ""
+        why = f": {reason}" if reason else ""
+        fields = {**self.log_fields("state"), "state": state, "reason": reason}
+        logger.log(level, "unit %d (%s): %s%s%s", self.id, self.ip, before, state, why, extra=fields)
+        self.told_state = state
+
+    def log_fields(self, event: str) -> dict[str, object]:
+        """What a line of the log about it carries besides its text."""
+        return {"event": event, "unit_id": self.id, "ip": self.ip}
 
     def clock_uncertainty_ns(self, now_ns: int) -> int | None:
         """How far `age_s` may be off."""
@@ -261,10 +282,12 @@ class Registry:
                     slot.set_pose(old.T_world_camera)
         elif slot.serial != request.serial:
             note = f"the camera changed from {slot.serial} to {request.serial}, so its pose is void"
-            logger.warning("unit %d (%s): %s", slot.id, ip, note)
+            logger.warning("unit %d (%s): %s", slot.id, ip, note, extra=slot.log_fields("camera"))
             slot.set_pose(None, note)
         for old in elsewhere:
-            logger.warning("unit %d (%s): camera %s is at %s now", old.id, old.ip, old.serial, ip)
+            logger.warning(
+                "unit %d (%s): camera %s is at %s now", old.id, old.ip, old.serial, ip, extra=old.log_fields("camera")
+            )
             self.remove(old.id)
         slot.serial, slot.model, slot.software = request.serial, request.model, request.software
         slot.boot_id = request.boot_id

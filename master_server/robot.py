@@ -74,6 +74,11 @@ class RobotJoints:
         newest = self.newest
         return None if newest is None else (now_ns - newest.at_ns) / NS_PER_S
 
+    def expires_at_ns(self, stale_after_s: float) -> int | None:
+        """When the newest sample becomes too old; None without one."""
+        newest = self.newest
+        return None if newest is None else newest.at_ns + round(stale_after_s * NS_PER_S)
+
     def state(self, now_ns: int, stale_after_s: float) -> tuple[RobotState, str]:
         """Whether units can filter the robot, and why not in words."""
         if self.joint_names is None:

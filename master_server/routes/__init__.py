@@ -7,7 +7,8 @@ In the order of the flow:
     update    `POST /update`, the path that every frame of every unit takes
     units     registering, and what is known of each unit
     cell      the cell's document and meshes
-    map       the merged map and the settings
+    map       the merged map, the coverage and the settings
+    stream    the merged map as it changes
     robot     the robot's joints
     health    whether the master lives
 """

@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 
 from master_server.access import Access
+from master_server.answers import CoverageAnswer
 from master_server.app import make_app
 from master_server.routes import common
 from shared.clock import monotonic_ns
 from shared.messages import InitializeAnswer, RobotAnswer, UnitRow, VoxelsAnswer
 from shared.settings import Settings
 from shared.timebase import Exchange
-from shared.wire import MAX_UPDATE_BYTES, MEDIA_TYPE, decode, decode_update_answer, encode, encode_update
+from shared.wire import MAX_UPDATE_BYTES, MEDIA_TYPE, decode, decode_update_answer, encode, encode_update, pack_seen
 from tests.master_server.fakes import AT_ORIGIN, GOOD, FakeUnit, master, sees_all
 
 UNIT = "unit-token-0123456789"
@@ -112,6 +113,24 @@ async def test_unseen_blocks_on_request(desk: Desk) -> None:
     assert (await desk.call("GET", "/voxels")).json()["unseen"] is None
 
 
+async def test_how_much_of_the_cell_is_seen(desk: Desk) -> None:
+    first, second = await desk.register("10.0.0.1", "A"), await desk.register("10.0.0.2", "B")
+    await desk.update(first, seen=sees_all(first.master))
+    half = np.zeros((10, 20, 5), bool)
+    half[:5] = True
+    await desk.update(second, seen=pack_seen(half, 0.1))
+    found = (await desk.call("GET", "/coverage", UNIT)).json()
+    CoverageAnswer.model_validate(found)
+    assert found["shares"] == [0.0, 0.5, 0.5, 0.0]
+    assert (found["seen_share"], found["block_count"], found["units_live"]) == (1.0, 1000, 2)
+    assert found["blocks"] is None
+    assert found["complete"] is False
+    assert found["reasons"] == ["the robot has not reported its joints yet"]
+    packed = await desk.call("GET", "/coverage?blocks=true", headers={"Accept": MEDIA_TYPE})
+    blocks = msgpack.unpackb(packed.content)["blocks"]
+    assert np.array_equal(np.repeat(blocks["counts"], blocks["runs"]).reshape(blocks["shape"]), 1 + half)
+
+
 async def test_units_have_a_row_each(desk: Desk) -> None:
     await desk.register("10.0.0.1", "A")
     unit = await desk.register("10.0.0.2", "B")
@@ -146,6 +165,7 @@ DOORS = [
     ("POST", "/initialize", 401, 422, 403),
     ("POST", "/update", 401, 422, 403),
     ("GET", "/voxels", 401, 200, 200),
+    ("GET", "/coverage", 401, 200, 200),
     ("GET", "/units", 401, 200, 200),
     ("GET", "/settings", 401, 200, 200),
     ("GET", "/cell", 401, 200, 200),

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+
+import msgpack
+import numpy as np
+import pytest
+
+from master_server.answers import (
+    CoverageAnswer,
+    StreamMessage,
+    as_json,
+    as_msgpack,
+    coverage_fields,
+    coverage_shares,
+    map_fields,
+    unit_states,
+)
+from shared.wire import pack_seen
+from tests.master_server.fakes import START_NS, S, joined, master, sees_all
+
+NOW_NS = START_NS + S
+
+
+def test_shares_are_of_what_live_units_see() -> None:
+    seen_by = np.array([[[0, 1, 2], [3, 4, 255]]], np.uint8)
+    assert coverage_shares(seen_by) == pytest.approx([1 / 6, 1 / 6, 1 / 6, 3 / 6])
+    assert coverage_shares(np.zeros((2, 2, 2), np.uint8)) == [1.0, 0.0, 0.0, 0.0]
+
+
+def test_blocks_come_as_runs() -> None:
+    one = master()
+    grid = np.random.default_rng(1).random((10, 20, 5)) < 0.5
+    joined(one, 1).update(NOW_NS, seen=pack_seen(grid, 0.1))
+    joined(one, 2).update(NOW_NS, seen=sees_all(one))
+    found = CoverageAnswer.model_validate(coverage_fields(one, True, NOW_NS))
+    assert found.blocks is not None
+    assert np.array_equal(np.repeat(found.blocks.counts, found.blocks.runs).reshape(found.blocks.shape), 1 + grid)
+    assert found.shares == pytest.approx([0.0, 1.0 - grid.mean(), grid.mean(), 0.0])
+
+
+def test_a_silent_unit_covers_nothing() -> None:
+    one = master()
+    joined(one).update(NOW_NS, seen=sees_all(one))
+    assert coverage_fields(one, False, NOW_NS)["seen_share"] == 1.0
+    later = coverage_fields(one, True, NOW_NS + 2 * S)
+    assert (later["seen_share"], later["units_live"], later["complete"]) == (0.0, 0, False)
+    assert (later["blocks"]["counts"], later["blocks"]["runs"]) == ([0], [1000])
+
+
+def test_json_and_msgpack_say_the_same() -> None:
+    one = master()
+    joined(one).update(NOW_NS, [0, 411])
+    fields = map_fields(one.view(NOW_NS), "centres", None, NOW_NS)
+    fields |= {"number": 1, "units": unit_states(one, NOW_NS)}
+    assert json.loads(as_json(fields)) == msgpack.unpackb(as_msgpack(fields))
+    message = StreamMessage.model_validate_json(as_json(fields))
+    assert message.voxels == [[0.025, 0.025, 0.025], [0.075, 0.075, 0.075]]
+    assert (message.units[0].voxels, message.units[0].state) == (2, "live")

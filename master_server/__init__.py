@@ -3,7 +3,6 @@
 
 In the order of the flow:
 
-    config       the master's own configuration
     access       who may do what: two tokens
     robot        the robot's joints, as a short history
     coverage     what the units look through, united
@@ -12,6 +11,11 @@ In the order of the flow:
     master       all of that held together, without a network
     answers      what readers are told of it
     stream       the map as it changes, for many listeners
+    recording_format  what a recording holds, and a moment to be recorded
+    foxglove     such a moment in the schemas that Foxglove shows
+    recording_file    one file of a recording
+    recording    files one after another, in a thread that nothing waits for
+    config       the master's own configuration
     routes/      the same as HTTP
     app          the web application, assembled
     websocket    a socket that keeps nothing for who does not read

@@ -21,6 +21,7 @@ from master_server.access import Role, load_access, token_file
 from master_server.app import make_app
 from master_server.config import ENVIRONMENT_PREFIX, MasterConfig
 from master_server.master import Master
+from master_server.recording import Recorder
 from master_server.websocket import SERVER_OPTIONS
 from shared.cell import Cell
 from shared.configuration import assignments, load
@@ -78,7 +79,8 @@ class _Server(uvicorn.Server):
 def _serve(config: MasterConfig) -> None:
     cell = Cell.load(config.cell)
     access = load_access(config.state_dir, config.public_reads)
-    app = make_app(Master(cell, config.settings), access)
+    master = Master(cell, config.settings)
+    app = make_app(master, access, Recorder(master, config.recording, config.state_dir / "recordings"))
     listener = _listen(config.host, config.port)
     port = listener.getsockname()[1]
     host = "127.0.0.1" if config.host in ANY_ADDRESS else config.host
@@ -130,6 +132,8 @@ def _config(options: argparse.Namespace) -> MasterConfig:
     for name in ("cell", "host", "port", "state_dir", "ready_file"):
         if (value := getattr(options, name)) is not None:
             overrides[name] = value
+    if options.record is not None:
+        overrides |= {"recording.enabled": True, "recording.folder": str(options.record)}
     if options.public_reads:
         overrides["public_reads"] = True
     return load(MasterConfig, options.config, os.environ, ENVIRONMENT_PREFIX, overrides)
@@ -149,6 +153,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--state-dir", type=Path, metavar="DIR", help="where tokens are kept")
     parser.add_argument("--ready-file", type=Path, metavar="FILE", help="written as JSON when the master can be asked")
     parser.add_argument("--public-reads", action="store_true", help="reading needs no token")
+    parser.add_argument("--record", type=Path, metavar="DIR", help="record what the master sees, as MCAP files")
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="any other, as in settings.voxel_size_m=0.03"
     )

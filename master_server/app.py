@@ -14,7 +14,8 @@ from starlette.types import Receive, Scope, Send
 
 from master_server.access import Access
 from master_server.master import Master
-from master_server.routes import cell, health, map, robot, stream, units
+from master_server.recording import Recorder
+from master_server.routes import cell, health, map, recording, robot, stream, units
 from master_server.routes.update import UpdateEndpoint
 from master_server.stream import Stream
 from shared.configuration import sentence_of
@@ -33,7 +34,7 @@ class Application(FastAPI):
             await super().__call__(scope, receive, send)
 
 
-def make_app(master: Master, access: Access) -> Application:
+def make_app(master: Master, access: Access, recorder: Recorder | None = None) -> Application:
     """The application that serves one master."""
     update = UpdateEndpoint(master, access)
     listeners = Stream(master)
@@ -41,10 +42,14 @@ def make_app(master: Master, access: Access) -> Application:
     @asynccontextmanager
     async def running(app: FastAPI) -> AsyncIterator[None]:
         listeners.start()
+        if recorder is not None and recorder.enabled:
+            await recorder.begin()
         try:
             yield
         finally:
             listeners.stop()
+            if recorder is not None:
+                await recorder.stop()
 
     app = Application(
         title="Cellwatch master",
@@ -62,7 +67,8 @@ def make_app(master: Master, access: Access) -> Application:
     app.state.master = master
     app.state.access = access
     app.state.stream = listeners
-    for module in (units, cell, map, stream, robot, health):
+    app.state.recorder = recorder
+    for module in (units, cell, map, stream, robot, recording, health):
         app.include_router(module.router)
     return app
 

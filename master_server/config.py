@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from master_server.recording import RecordingConfig
 from shared.settings import Settings
 
 ENVIRONMENT_PREFIX = "CELLWATCH_MASTER_"
@@ -34,6 +35,7 @@ class MasterConfig(BaseModel):
     state_dir: Path = Field(default_factory=default_state_dir, description="Where tokens are kept.")
     public_reads: bool = Field(default=False, description="Whether reading needs no token.")
     settings: Settings = Field(default=Settings(), description="What the master starts with.")
+    recording: RecordingConfig = Field(default=RecordingConfig(), description="What is recorded, and how much is kept.")
     ready_file: Path | None = Field(
         default=None, description="Written as JSON (url, port, pid, token files) when the master can be asked."
     )

@@ -10,5 +10,6 @@ In the order of the flow:
     map       the merged map, the coverage and the settings
     stream    the merged map as it changes
     robot     the robot's joints
+    recording  recording what the master sees
     health    whether the master lives
 """

@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -16,6 +17,7 @@ import pytest
 from master_server.access import Access
 from master_server.answers import CoverageAnswer
 from master_server.app import make_app
+from master_server.recording import Recorder, RecordingConfig
 from master_server.routes import common
 from shared.clock import monotonic_ns
 from shared.messages import InitializeAnswer, RobotAnswer, UnitRow, VoxelsAnswer
@@ -179,6 +181,10 @@ DOORS = [
     ("POST", "/units/1/calibrate", 401, 403, 404),
     ("POST", "/units/1/refine", 401, 403, 404),
     ("DELETE", "/units/1", 401, 403, 404),
+    # This application has nowhere to write to.
+    ("GET", "/recording", 401, 409, 409),
+    ("POST", "/recording", 401, 403, 409),
+    ("DELETE", "/recording", 401, 403, 409),
     ("GET", "/healthz", 200, 200, 200),
 ]
 
@@ -201,6 +207,20 @@ async def test_every_route_but_health_has_its_door_tested(desk: Desk) -> None:
     schema = (await desk.call("GET", "/openapi.json", None)).json()
     served = {(method.upper(), path) for path, methods in schema["paths"].items() for method in methods}
     assert served <= listed
+
+
+async def test_recording_is_switched_while_it_runs(tmp_path: Path) -> None:
+    watched = master()
+    recorder = Recorder(watched, RecordingConfig(free_bytes_min=0), tmp_path)
+    desk = Desk(make_app(watched, Access(UNIT.encode(), OPERATOR.encode()), recorder))
+    assert (await desk.call("GET", "/recording")).json()["recording"] is False
+    began = await desk.call("POST", "/recording")
+    assert began.status_code == 200
+    assert began.json()["recording"] is True
+    ended = (await desk.call("DELETE", "/recording")).json()
+    assert ended["file"] == began.json()["file"]
+    assert ended["bytes"] == Path(ended["file"]).stat().st_size > 0
+    assert (await desk.call("GET", "/recording", UNIT)).json() == ended
 
 
 async def test_public_reads() -> None:

@@ -49,6 +49,9 @@ class Coverage:
                 f"seen.block_size_m: expected a multiple of {self.blocks.voxel_size_m}, got {report.block_size_m}"
             )
         grid = unpack_seen(report)
+        if grid.shape == self.blocks.shape and factor == 1:
+            self._seen[unit_id] = grid
+            return
         # Cropped before it grows, so that the memory is that of the cell whatever was reported.
         grid = grid[tuple(slice(-(-count // factor)) for count in self.blocks.shape)]
         for axis, count in enumerate(self.blocks.shape):

@@ -26,24 +26,26 @@ class MergedMap:
         self.revision = 0
         self._witnesses = np.zeros(lattice.cell_count, dtype=np.uint8)
         self._keys: dict[int, NDArray[np.uint32]] = {}
+        self._places: dict[int, NDArray[np.intp]] = {}
         self._snapshot: tuple[NDArray[np.uint32], NDArray[np.uint8]] | None = None
 
     def replace(self, unit_id: int, keys: NDArray[np.uint32]) -> None:
         """From now on the unit reports `keys` (N,): ascending, each once, below the lattice's cell count."""
-        before = self._keys.get(unit_id)
-        if before is keys:
+        if self._keys.get(unit_id) is keys:
             return
+        before = self._places.get(unit_id)
         if before is not None:
             self._witnesses[before] -= 1
-        self._witnesses[keys] += 1
-        self._keys[unit_id] = keys
+        # As numpy's own kind of index, which it would otherwise make of them twice at each use.
+        places = keys.astype(np.intp)
+        self._witnesses[places] += 1
+        self._keys[unit_id], self._places[unit_id] = keys, places
         self._changed()
 
     def withdraw(self, unit_id: int) -> None:
         """From now on the unit reports nothing; harmless when it did not."""
-        before = self._keys.pop(unit_id, None)
-        if before is not None:
-            self._witnesses[before] -= 1
+        if self._keys.pop(unit_id, None) is not None:
+            self._witnesses[self._places.pop(unit_id)] -= 1
             self._changed()
 
     def voxels(self) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:

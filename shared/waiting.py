@@ -8,7 +8,8 @@ task that is woken thirty times a second then goes on for ever although it was t
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Generator
+from types import coroutine
 from typing import Any
 
 
@@ -22,3 +23,34 @@ async def within(timeout_s: float, work: Coroutine[Any, Any, object]) -> bool:
     if done:
         task.result()
     return bool(done)
+
+
+async def at_once_or_within(timeout_s: float, work: Coroutine[Any, Any, object]) -> bool:
+    """As `within`, for work that mostly need not wait at all: it then costs neither a task nor a turn of the loop.
+
+    Up to its first wait, `work` runs in the caller's task.
+    """
+    try:
+        waits_for = work.send(None)
+    except StopIteration:
+        return True
+    return await within(timeout_s, _resumed(work, waits_for))
+
+
+async def _resumed(work: Coroutine[Any, Any, object], waits_for: object) -> None:
+    """The rest of `work`, which has come to its first wait."""
+    await _steps(work, waits_for)
+
+
+@coroutine
+def _steps(work: Coroutine[Any, Any, object], waits_for: object) -> Generator[object, Any, None]:
+    try:
+        while True:
+            try:
+                value = yield waits_for
+            except BaseException as error:
+                waits_for = work.throw(error)
+            else:
+                waits_for = work.send(value)
+    except StopIteration:
+        return

@@ -6,18 +6,22 @@ The body of `/update` is a msgpack map of the fields of `UpdateRequest` that are
     id, session, sequence, sent_at_ns   integers, 1 to 9 bytes each
     captured_at_ns, joints_until_ns     integers of 9 bytes
     exchange                            4 integers, 37 bytes
-    versions                            map of 4 small integers, 32 bytes
+    versions                            array of 4 small integers, 5 to 13 bytes
     keys                                binary, 4 bytes a voxel: ascending little-endian uint32
     seen                                map, only when it changed: at most 4 kB (see `pack_seen`)
-    health                              map, some 60 bytes
+    health                              array of 8 values, some 50 bytes
 
 and its answer those of `UpdateAnswer`, where each joint sample is `[at_ns, positions, velocities]`
-with little-endian float32 as binary. Both with all their HTTP headers stay within 4 bytes a voxel + 800.
+with little-endian float32 as binary. `versions` and `health` are the values of their fields in order: at 30 updates a
+second the names would be a fifth of all that is not voxels. Both with all their HTTP headers, and joints at 125 Hz
+in the answer, stay within 4 bytes a voxel + 800.
 """
 
 from __future__ import annotations
 
+import math
 import zlib
+from operator import attrgetter
 from typing import Any, TypeVar
 
 import msgpack
@@ -30,10 +34,12 @@ from shared.errors import InputError, WireError
 from shared.messages import (
     MAX_SEEN_BYTES,
     MAX_VOXELS,
+    Health,
     JointSample,
     SeenReport,
     UpdateAnswer,
     UpdateRequest,
+    Versions,
 )
 
 MEDIA_TYPE = "application/msgpack"
@@ -46,8 +52,16 @@ MAX_UPDATE_BYTES = 4 * MAX_VOXELS + MAX_SEEN_BYTES + MAX_FIXED_BYTES
 MAX_ANSWER_BYTES = 2**20
 """Of what a master answers to a unit, meshes apart; a cell's document is the largest."""
 
+SHOWN_CHARS = 60
+"""Enough of a wrong value to recognise it."""
+
 MAX_SEEN_BLOCKS = 2**22
 """A hall of 64 m by 64 m by 10 m in blocks of 100 mm; half a MiB of bits."""
+
+ROWS: dict[str, type[BaseModel]] = {"versions": Versions, "health": Health}
+"""Fields of an update and its answer that travel as the bare values of their own fields, in order."""
+
+_VALUES = {name: attrgetter(*model.model_fields) for name, model in ROWS.items()}
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -84,7 +98,10 @@ def decode(model: type[Model], data: bytes, max_bytes: int = MAX_ANSWER_BYTES) -
 
 def encode_update(update: UpdateRequest) -> bytes:
     """The body of `POST /update`."""
-    packed: bytes = msgpack.packb(update.model_dump(exclude_defaults=True))
+    fields = update.model_dump(exclude_defaults=True)
+    for name in fields.keys() & ROWS:
+        fields[name] = _VALUES[name](getattr(update, name))
+    packed: bytes = msgpack.packb(fields)
     return packed
 
 
@@ -94,17 +111,19 @@ def decode_update(data: bytes) -> UpdateRequest:
     Raises:
         WireError: as in `decode`.
     """
-    return decode(UpdateRequest, data, MAX_UPDATE_BYTES)
+    return _validated(UpdateRequest, _named(unpack(data, MAX_UPDATE_BYTES)))
 
 
 def encode_update_answer(answer: UpdateAnswer) -> bytes:
     """The body of the answer to `POST /update`."""
-    fields = answer.model_dump(exclude_none=True)
-    fields["joints"] = [
-        (sample.at_ns, _floats(sample.positions), None if sample.velocities is None else _floats(sample.velocities))
-        for sample in answer.joints
-    ]
-    packed: bytes = msgpack.packb({name: value for name, value in fields.items() if value not in ((), [])})
+    fields = answer.model_dump(exclude_defaults=True, exclude={"versions", "joints"})
+    fields["versions"] = _VALUES["versions"](answer.versions)
+    if answer.joints:
+        fields["joints"] = [
+            (sample.at_ns, _floats(sample.positions), None if sample.velocities is None else _floats(sample.velocities))
+            for sample in answer.joints
+        ]
+    packed: bytes = msgpack.packb(fields)
     return packed
 
 
@@ -114,7 +133,7 @@ def decode_update_answer(data: bytes) -> UpdateAnswer:
     Raises:
         WireError: as in `decode`.
     """
-    fields = unpack(data, MAX_ANSWER_BYTES)
+    fields = _named(unpack(data, MAX_ANSWER_BYTES))
     if isinstance(fields, dict) and "joints" in fields:
         fields["joints"] = _joint_samples(fields["joints"])
     return _validated(UpdateAnswer, fields)
@@ -163,7 +182,7 @@ def unpack_seen(report: SeenReport) -> NDArray[np.bool_]:
     Raises:
         WireError: too many blocks, damaged, or not as many bits as its shape has blocks.
     """
-    blocks = int(np.prod(report.shape, dtype=np.int64))
+    blocks = math.prod(report.shape)
     if blocks > MAX_SEEN_BLOCKS:
         raise WireError(f"seen: expected at most {MAX_SEEN_BLOCKS} blocks, got {blocks}")
     length = (blocks + 7) // 8
@@ -183,6 +202,18 @@ def _validated(model: type[Model], fields: Any) -> Model:
         return model.model_validate(fields, strict=True)
     except ValidationError as error:
         raise WireError(sentence(error)) from error
+
+
+def _named(fields: Any) -> Any:
+    """What came, with the names of what travels without."""
+    if isinstance(fields, dict):
+        for name, model in ROWS.items():
+            if name in fields:
+                row, names = fields[name], model.model_fields
+                if not isinstance(row, tuple) or len(row) != len(names):
+                    raise WireError(f"{name}: expected an array of {len(names)} values, got {repr(row)[:SHOWN_CHARS]}")
+                fields[name] = dict(zip(names, row, strict=True))
+    return fields
 
 
 def _floats(values: tuple[float, ...]) -> bytes:

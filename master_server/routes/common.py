@@ -17,7 +17,7 @@ from starlette.types import Message, Scope
 from master_server.access import ANYONE, OPERATORS, UNITS, Access, Role
 from master_server.master import Master
 from shared.errors import Refusal, WireError
-from shared.waiting import within
+from shared.waiting import at_once_or_within
 from shared.wire import MEDIA_TYPE, unpack
 
 MAX_BODY_BYTES = 2**18
@@ -41,7 +41,7 @@ async def body_of(request: Request, max_bytes: int) -> bytes:
         raise Refusal(413, f"body: expected at most {max_bytes} bytes, got {declared}")
     body = bytearray()
     try:
-        if not await within(BODY_TIMEOUT_S, _read(request, max_bytes, body)):
+        if not await at_once_or_within(BODY_TIMEOUT_S, _read(request, max_bytes, body)):
             raise Refusal(408, f"body: expected all of it within {BODY_TIMEOUT_S:g} s, got {len(body)} bytes")
     except ClientDisconnect as error:
         raise Refusal(400, "body: the sender went away") from error

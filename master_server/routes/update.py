@@ -7,7 +7,7 @@ Fifty units at 30 frames a second take it 1,500 times a second.
 from __future__ import annotations
 
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import JSONResponse
 from starlette.types import Receive, Scope, Send
 
 from master_server.access import UNITS, Access
@@ -16,6 +16,8 @@ from master_server.routes.common import authorization_of, body_of, ip_of
 from shared.clock import monotonic_ns
 from shared.errors import Refusal, WireError
 from shared.wire import MAX_UPDATE_BYTES, MEDIA_TYPE, decode_update, encode_update_answer
+
+CONTENT_TYPE = (b"content-type", MEDIA_TYPE.encode())
 
 
 class UpdateEndpoint:
@@ -28,17 +30,20 @@ class UpdateEndpoint:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         request = Request(scope, receive)
         try:
-            response = await self._answer(request)
+            body = await self._answer(request)
         except Refusal as refusal:
-            response = JSONResponse({"detail": str(refusal)}, refusal.status)
+            await JSONResponse({"detail": str(refusal)}, refusal.status)(scope, receive, send)
         except WireError as error:
-            response = JSONResponse({"detail": str(error)}, 422)
-        await response(scope, receive, send)
+            await JSONResponse({"detail": str(error)}, 422)(scope, receive, send)
+        else:
+            length = (b"content-length", str(len(body)).encode())
+            await send({"type": "http.response.start", "status": 200, "headers": [CONTENT_TYPE, length]})
+            await send({"type": "http.response.body", "body": body})
 
-    async def _answer(self, request: Request) -> Response:
+    async def _answer(self, request: Request) -> bytes:
         self._access.check(authorization_of(request), UNITS)
         body = await body_of(request, MAX_UPDATE_BYTES)
         received_at_ns = monotonic_ns()
         answer = self._master.update(decode_update(body), ip_of(request.scope), received_at_ns)
         answer = answer.model_copy(update={"answered_at_ns": monotonic_ns()})
-        return Response(encode_update_answer(answer), media_type=MEDIA_TYPE)
+        return encode_update_answer(answer)

@@ -7,7 +7,7 @@ import asyncio
 
 import pytest
 
-from shared.waiting import within
+from shared.waiting import at_once_or_within, within
 
 
 async def test_done_or_not() -> None:
@@ -15,6 +15,62 @@ async def test_done_or_not() -> None:
     assert not await within(0.01, event.wait())
     event.set()
     assert await within(0.01, event.wait())
+
+
+async def test_what_need_not_wait_is_done_in_the_task_of_the_caller() -> None:
+    ran_in: list[asyncio.Task[object] | None] = []
+    event = asyncio.Event()
+
+    async def work() -> None:
+        ran_in.append(asyncio.current_task())
+        await event.wait()
+        ran_in.append(asyncio.current_task())
+
+    event.set()
+    assert await at_once_or_within(0.01, work())
+    assert ran_in == [asyncio.current_task()] * 2
+
+
+async def test_what_has_to_wait_goes_on_where_it_was() -> None:
+    first, second = asyncio.Event(), asyncio.Event()
+    done: list[str] = []
+
+    async def work() -> None:
+        await first.wait()
+        done.append("first")
+        await second.wait()
+        done.append("second")
+
+    loop = asyncio.get_running_loop()
+    loop.call_soon(first.set)
+    loop.call_later(0.01, second.set)
+    assert await at_once_or_within(1.0, work())
+    assert done == ["first", "second"]
+
+
+@pytest.mark.parametrize("waits", [False, True])
+async def test_errors_are_raised_at_once_and_later(waits: bool) -> None:
+    async def fail() -> None:
+        await asyncio.sleep(0.01 * waits)
+        raise LookupError("nothing there")
+
+    with pytest.raises(LookupError, match="nothing there"):
+        await at_once_or_within(1.0, fail())
+
+
+async def test_what_waits_too_long_is_cancelled_where_it_waits() -> None:
+    cancelled = asyncio.Event()
+
+    async def work() -> None:
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            cancelled.set()
+            raise
+
+    assert not await at_once_or_within(0.01, work())
+    await asyncio.sleep(0)
+    assert cancelled.is_set()
 
 
 async def test_errors_are_raised() -> None:

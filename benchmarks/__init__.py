@@ -16,4 +16,8 @@ In the order of the flow:
     ur3_scene    a UR3 in a room, something unknown beside it: what the speed is measured on
     peers        the same work by Open3D, OctoMap and Embree
     pipeline     what a frame costs, in turns with them
+    traffic      what units send, in the very bytes of their client
+    load         a process that sends it for many units, and counts
+    bare_fastapi what a master is measured against
+    master       what one master bears
 """

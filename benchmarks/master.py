@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What one master bears: a real one on loopback, and many units at addresses of their own that post to it.
+
+The master has one core of this machine to itself, and what makes the load (units, the robot's controller) another. How
+many updates it takes at most is measured in turns with a bare route of FastAPI on the same core, so that the ratio says
+something where the figure itself depends on the machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.load import FRAME_RATE_HZ, Plan
+from benchmarks.report import RESULTS, Mark, line, table, write
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.errors import CellwatchError, UplinkError
+from simulation.fleet import MASTER_PREFIX
+from simulation.processes import Child, Processes
+from simulation.world import DEMO_CELL
+
+UNITS = (1, 4, 10, 50)
+VOXELS = (100, 1000)
+SECONDS, WARM_UP_S = 8.0, 1.0
+TURNS = 3
+
+MOST_UNITS, MOST_VOXELS = 50, 1000
+"""In flight at once, so that the master never waits for the load."""
+
+P99_MS, MOST_PER_S = 6.0, 4000.0
+BYTES_A_VOXEL, BYTES_BESIDE = 4, 800
+
+READY_S = 30.0
+"""For a process to be there on a busy machine."""
+
+POLL_S = 0.02
+
+
+class Bench:
+    """Starts servers and loads, each on its core."""
+
+    def __init__(self, processes: Processes, folder: Path, seconds: float) -> None:
+        cores = sorted(os.sched_getaffinity(0))
+        self._server_core, self._load_core = cores[-1], cores[0]
+        self._processes = processes
+        self._folder = folder
+        self._seconds = seconds
+
+    @property
+    def apart(self) -> bool:
+        """Whether the server has a core of its own."""
+        return self._server_core != self._load_core
+
+    async def at_rate(self, units: int, voxels: int) -> dict[str, Any]:
+        """A master with so many units of 30 frames a second."""
+        found = await self._run(units, voxels, FRAME_RATE_HZ, bare=False)
+        seen = found["bytes_seen"] / max(found["seen_reports"], 1)
+        both = (found["bytes_out"] + found["bytes_in"] - found["bytes_seen"]) / max(found["counted"], 1)
+        return {
+            "units": units,
+            "voxels": voxels,
+            "updates": found["sent"],
+            **{name: found[name] for name in ("p50_ms", "p99_ms", "max_ms", "lost", "cpu_percent")},
+            "bytes_per_update": both,
+            "bytes_per_seen_report": seen,
+            "map_wrong": found["map_wrong"],
+            "trouble": found["trouble"],
+        }
+
+    async def at_most(self, bare: bool) -> float:
+        """Updates of MOST_VOXELS voxels that a server takes each second."""
+        found = await self._run(MOST_UNITS, MOST_VOXELS, None, bare)
+        if found["lost"] or found["map_wrong"]:
+            raise UplinkError(f"{found['lost']} updates lost: {found['trouble']}{found['map_wrong']}")
+        return float(found["counted"] / self._seconds)
+
+    async def _run(self, units: int, voxels: int, rate_hz: float | None, bare: bool) -> dict[str, Any]:
+        os.sched_setaffinity(0, {self._server_core})
+        server, ready = await self._server(bare)
+        os.sched_setaffinity(0, {self._load_core})
+        children = [server]
+        if not bare:
+            children.append(
+                await self._processes.start(
+                    "controller",
+                    "simulation.controller",
+                    *("--url", ready["url"], "--token-file", ready["operator_token_file"]),
+                )
+            )
+        token_file = self._folder / "token"
+        token_file.write_text("no token is asked for here" if bare else Path(ready["unit_token_file"]).read_text())
+        plan = Plan(
+            ready["url"], str(token_file), str(DEMO_CELL), units, voxels, self._seconds, WARM_UP_S, rate_hz,
+            ready["pid"], bare,
+        )  # fmt: skip
+        result = self._folder / "result.json"
+        result.unlink(missing_ok=True)
+        (self._folder / "plan.json").write_text(json.dumps(asdict(plan)))
+        load = await self._processes.start(
+            "load", "benchmarks.load", str(self._folder / "plan.json"), str(result), may_end=True
+        )
+        await load.process.wait()
+        failed = [child for child in (*children, load) if child.failed]
+        if failed or not result.exists():
+            child = (*failed, load)[0]
+            raise UplinkError(f"{child.name} failed: {child.ended}; {child.log_tail()}")
+        await self._processes.stop(*children)
+        found: dict[str, Any] = json.loads(result.read_text())
+        return found
+
+    async def _server(self, bare: bool) -> tuple[Child, dict[str, Any]]:
+        ready_file = self._folder / "ready.json"
+        ready_file.unlink(missing_ok=True)
+        if bare:
+            server = await self._processes.start("bare", "benchmarks.bare_fastapi", "--ready-file", str(ready_file))
+        else:
+            server = await self._processes.start(
+                "master",
+                "master_server",
+                *("--cell", str(DEMO_CELL), "--host", "127.0.0.1", "--port", "0"),
+                *("--state-dir", str(self._folder / "state"), "--ready-file", str(ready_file)),
+            )
+        deadline_ns = monotonic_ns() + round(READY_S * NS_PER_S)
+        while not ready_file.exists():
+            if server.ended or monotonic_ns() > deadline_ns:
+                raise UplinkError(f"{server.name} did not start; {server.log_tail()}")
+            await asyncio.sleep(POLL_S)
+        ready: dict[str, Any] = json.loads(ready_file.read_text())
+        return server, ready
+
+
+async def measure(units: Sequence[int], voxels: Sequence[int], seconds: float, turns: int) -> dict[str, Any]:
+    """All loads, then the most that master and bare route take, in turns; tables are printed on the way."""
+    with tempfile.TemporaryDirectory(prefix="cellwatch-bench-") as scratch:
+        folder = Path(scratch)
+        async with Processes(folder / "logs", without=(MASTER_PREFIX,)) as processes:
+            bench = Bench(processes, folder, seconds)
+            print(f"A master and its units at {FRAME_RATE_HZ:g} updates/s each, {seconds:g} s, joints at 125 Hz")
+            loads = [await bench.at_rate(n, size) for n in units for size in voxels]
+            print("\n".join(table(*_load_table(loads))), flush=True)
+            ours, bare = [], []
+            for _ in range(turns):
+                ours.append(await bench.at_most(bare=False))
+                bare.append(await bench.at_most(bare=True))
+    print(f"Updates/s of {MOST_VOXELS} voxels at most, {MOST_UNITS} connections, {turns} turns of {seconds:g} s")
+    rows: list[tuple[str | float, ...]] = [
+        ("the master, everything on", *ours),
+        ("bare FastAPI, msgpack to numpy", *bare),
+    ]
+    print("\n".join(table(("", *(f"turn {n + 1}" for n in range(turns))), rows)), flush=True)
+    return {
+        "loads": loads,
+        "max_updates_per_s": float(np.median(ours)),
+        "bare_fastapi_updates_per_s": float(np.median(bare)),
+        "vs_bare_fastapi": float(np.median(ours) / np.median(bare)),
+        "turns": {"max_updates_per_s": ours, "bare_fastapi_updates_per_s": bare},
+        "own_core": bench.apart,
+        "load_average_before": os.getloadavg()[0],
+    }
+
+
+def marks_of(found: dict[str, Any]) -> list[Mark]:
+    """What is asked of a master."""
+    loads = found["loads"]
+    marks = [
+        Mark("updates lost", float(sum(load["lost"] for load in loads)), at_most=0.0),
+        Mark("loads after which the map was wrong", float(sum(bool(load["map_wrong"]) for load in loads)), at_most=0.0),
+        Mark(
+            f"bytes of an update and its answer beyond {BYTES_A_VOXEL} a voxel",
+            max(load["bytes_per_update"] - BYTES_A_VOXEL * load["voxels"] for load in loads),
+            at_most=float(BYTES_BESIDE),
+        ),
+        Mark(f"updates/s of {MOST_VOXELS} voxels", found["max_updates_per_s"], at_least=MOST_PER_S),
+    ]
+    for load in loads:
+        if (load["units"], load["voxels"]) == (MOST_UNITS, MOST_VOXELS):
+            name = f"{MOST_UNITS} units of {MOST_VOXELS} voxels: p99 of a round trip, ms"
+            marks.append(Mark(name, load["p99_ms"], at_most=P99_MS))
+    return marks
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, print the tables, and all of it as one line of JSON. Exit code 1 when a mark is missed."""
+    options = _parser().parse_args(arguments)
+    before = os.getloadavg()[0]
+    try:
+        found = asyncio.run(measure(options.units, options.voxels, options.seconds, options.turns))
+    except CellwatchError as error:
+        print(f"make bench-master: {error}", file=sys.stderr)
+        return 1
+    marks = marks_of(found)
+    print("\n".join(map(str, marks)))
+    found["load_average_before"] = before
+    document = found | {"marks": [mark.document() for mark in marks], "passed": all(mark.met for mark in marks)}
+    write("master", document, options.results)
+    print(line(document))
+    return 0 if document["passed"] else 1
+
+
+def _load_table(loads: list[dict[str, Any]]) -> tuple[tuple[str, ...], list[tuple[str | float, ...]]]:
+    names = {
+        "units": "units",
+        "voxels": "voxels",
+        "updates": "updates",
+        "lost": "lost",
+        "p50_ms": "p50 ms",
+        "p99_ms": "p99 ms",
+        "max_ms": "max ms",
+        "cpu_percent": "master CPU %",
+        "bytes_per_update": "bytes",
+        "bytes_per_seen_report": "seen report",
+    }
+    rows = [(*(load[name] for name in names), load["map_wrong"] or "right") for load in loads]
+    return (*names.values(), "map"), rows
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="make bench-master", description="What one master bears.")
+    parser.add_argument("--units", type=int, nargs="+", default=UNITS, help="loads of so many units (1 4 10 50)")
+    parser.add_argument("--voxels", type=int, nargs="+", default=VOXELS, help="in each update (100 1000)")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help=f"of each measurement ({SECONDS:g})")
+    parser.add_argument("--turns", type=int, default=TURNS, help=f"of the most that it takes ({TURNS})")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for master.json")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -11,6 +11,7 @@ In the order of the flow:
     master       all of that held together, without a network
     answers      what readers are told of it
     stream       the map as it changes, for many listeners
+    metrics      what a monitoring system reads
     recording_format  what a recording holds, and a moment to be recorded
     foxglove     such a moment in the schemas that Foxglove shows
     recording_file    one file of a recording

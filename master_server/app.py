@@ -14,10 +14,12 @@ from starlette.types import Receive, Scope, Send
 
 from master_server.access import Access
 from master_server.master import Master
+from master_server.metrics import Metrics
 from master_server.recording import Recorder
 from master_server.routes import cell, health, map, recording, robot, stream, units
 from master_server.routes.update import UpdateEndpoint
 from master_server.stream import Stream
+from shared.clock import monotonic_ns
 from shared.configuration import sentence_of
 from shared.errors import CellwatchError, InputError, Refusal, WireError
 
@@ -36,8 +38,9 @@ class Application(FastAPI):
 
 def make_app(master: Master, access: Access, recorder: Recorder | None = None) -> Application:
     """The application that serves one master."""
-    update = UpdateEndpoint(master, access)
     listeners = Stream(master)
+    metrics = Metrics(master, listeners)
+    update = UpdateEndpoint(master, access, metrics)
 
     @asynccontextmanager
     async def running(app: FastAPI) -> AsyncIterator[None]:
@@ -68,6 +71,8 @@ def make_app(master: Master, access: Access, recorder: Recorder | None = None) -
     app.state.access = access
     app.state.stream = listeners
     app.state.recorder = recorder
+    app.state.metrics = metrics
+    app.state.started_at_ns = monotonic_ns()
     for module in (units, cell, map, stream, robot, recording, health):
         app.include_router(module.router)
     return app

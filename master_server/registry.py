@@ -94,6 +94,8 @@ class Slot:
     asked: deque[_Asked] = field(default_factory=deque)
     last_command: CommandRow | None = None
     told_state: State | None = None
+    updates: int = 0
+    received_bytes: int = 0
 
     def set_pose(self, T_world_camera: Matrix | None, note: str = "") -> None:
         """The camera is elsewhere from now on, or nobody knows where; `note` tells why."""

@@ -11,5 +11,5 @@ In the order of the flow:
     stream    the merged map as it changes
     robot     the robot's joints
     recording  recording what the master sees
-    health    whether the master lives
+    health    whether the master lives, and how it fares
 """

@@ -12,6 +12,7 @@ from starlette.types import Receive, Scope, Send
 
 from master_server.access import UNITS, Access
 from master_server.master import Master
+from master_server.metrics import Metrics
 from master_server.routes.common import authorization_of, body_of, ip_of
 from shared.clock import monotonic_ns
 from shared.errors import Refusal, WireError
@@ -23,18 +24,19 @@ CONTENT_TYPE = (b"content-type", MEDIA_TYPE.encode())
 class UpdateEndpoint:
     """An ASGI application for the one path."""
 
-    def __init__(self, master: Master, access: Access) -> None:
+    def __init__(self, master: Master, access: Access, metrics: Metrics) -> None:
         self._master = master
         self._access = access
+        self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         request = Request(scope, receive)
         try:
             body = await self._answer(request)
-        except Refusal as refusal:
-            await JSONResponse({"detail": str(refusal)}, refusal.status)(scope, receive, send)
-        except WireError as error:
-            await JSONResponse({"detail": str(error)}, 422)(scope, receive, send)
+        except (Refusal, WireError) as error:
+            status = error.status if isinstance(error, Refusal) else 422
+            self._metrics.refused(status)
+            await JSONResponse({"detail": str(error)}, status)(scope, receive, send)
         else:
             length = (b"content-length", str(len(body)).encode())
             await send({"type": "http.response.start", "status": 200, "headers": [CONTENT_TYPE, length]})
@@ -44,6 +46,9 @@ class UpdateEndpoint:
         self._access.check(authorization_of(request), UNITS)
         body = await body_of(request, MAX_UPDATE_BYTES)
         received_at_ns = monotonic_ns()
-        answer = self._master.update(decode_update(body), ip_of(request.scope), received_at_ns)
+        update = decode_update(body)
+        answer = self._master.update(update, ip_of(request.scope), received_at_ns)
         answer = answer.model_copy(update={"answered_at_ns": monotonic_ns()})
-        return encode_update_answer(answer)
+        answered = encode_update_answer(answer)
+        self._metrics.accepted(update.id, len(body), monotonic_ns() - received_at_ns)
+        return answered

@@ -17,6 +17,7 @@ import pytest
 from master_server.access import Access
 from master_server.answers import CoverageAnswer
 from master_server.app import make_app
+from master_server.metrics import VERSION
 from master_server.recording import Recorder, RecordingConfig
 from master_server.routes import common
 from shared.clock import monotonic_ns
@@ -133,6 +134,31 @@ async def test_how_much_of_the_cell_is_seen(desk: Desk) -> None:
     assert np.array_equal(np.repeat(blocks["counts"], blocks["runs"]).reshape(blocks["shape"]), 1 + half)
 
 
+async def test_what_health_tells_everyone(desk: Desk) -> None:
+    await desk.register("10.0.0.1", "A")
+    await desk.update(await desk.register("10.0.0.2", "B"))
+    found = (await desk.call("GET", "/healthz", None)).json()
+    assert 0.0 <= found.pop("uptime_s") < 60.0
+    assert found == {"status": "ok", "version": VERSION, "units": 2, "live": 1}
+
+
+async def test_what_monitoring_reads(desk: Desk) -> None:
+    unit = await desk.register()
+    for _ in range(3):
+        assert (await desk.update(unit, 1, 2)).status_code == 200
+    await desk.update(unit, 1, token="wrong-token-0123456789")
+    await desk.update(unit, sequence=0)
+    response = await desk.call("GET", "/metrics", UNIT)
+    assert response.headers["content-type"].startswith("text/plain; version=")
+    lines = response.text.splitlines()
+    assert 'cellwatch_unit_updates_total{ip="10.0.0.1",unit="1"} 3.0' in lines
+    assert 'cellwatch_unit_state{ip="10.0.0.1",state="live",unit="1"} 1.0' in lines
+    assert 'cellwatch_updates_refused_total{status="401"} 1.0' in lines
+    assert 'cellwatch_updates_refused_total{status="409"} 1.0' in lines
+    assert "cellwatch_update_seconds_count 3.0" in lines
+    assert UNIT not in response.text
+
+
 async def test_units_have_a_row_each(desk: Desk) -> None:
     await desk.register("10.0.0.1", "A")
     unit = await desk.register("10.0.0.2", "B")
@@ -186,6 +212,7 @@ DOORS = [
     ("POST", "/recording", 401, 403, 409),
     ("DELETE", "/recording", 401, 403, 409),
     ("GET", "/healthz", 200, 200, 200),
+    ("GET", "/metrics", 401, 200, 200),
 ]
 
 

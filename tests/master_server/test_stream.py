@@ -208,7 +208,7 @@ async def test_a_fault_costs_one_picture(monkeypatch: pytest.MonkeyPatch) -> Non
 
 async def test_what_costs_much_comes_rarely_but_with_each_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream_module, "COST_SHARE_MAX", 1e-6)
-    one = master()
+    one = master(stale_after_s=60.0)
     unit = live(one, 1, 1)
     with Stream(one).listen(KEYS) as listener:
         first = await heard(listener)

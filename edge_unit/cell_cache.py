@@ -41,15 +41,18 @@ class CellCache:
         fetched = document is None
         if document is None:
             document = await client.cell_document()
+        last = self._last
+        in_memory = set() if last is None else set(last.meshes)
+        named = mesh_hashes(document)
         meshes: dict[str, bytes] = {}
-        for sha256 in mesh_hashes(document):
+        for sha256 in set(named) - in_memory:
             data = await asyncio.to_thread(self._read_mesh, sha256)
             if data is None:
                 data = await client.mesh(sha256)
                 await asyncio.to_thread(self._write, f"{sha256}.mesh", data)
             meshes[sha256] = data
         try:
-            cell = await asyncio.to_thread(Cell.from_document, document, meshes)
+            cell = await asyncio.to_thread(Cell.from_document, document, meshes, last)
             if cell.version != reference.sha256:
                 raise WireError(
                     f"cell {reference.name}: expected version {reference.sha256[:8]}, got {cell.version[:8]}"
@@ -59,7 +62,7 @@ class CellCache:
             await asyncio.to_thread(self._keep_only, set())
             raise
         if fetched:
-            await asyncio.to_thread(self._keep, reference.sha256, document, set(meshes))
+            await asyncio.to_thread(self._keep, reference.sha256, document, set(named))
         self._last = cell
         return cell
 

@@ -4,6 +4,9 @@
 In the order of the flow:
 
     access       who may do what: two tokens
+    published    the cell as it is given to units and operators
+    unpacking    a cell's folder as a zip becomes a document and its meshes
+    cell_loading a new cell is read while units go on
     robot        the robot's joints, as a short history
     coverage     what the units look through, united
     merge        the units' voxels, merged (Algorithm 9)

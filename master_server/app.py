@@ -13,6 +13,7 @@ from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from master_server.access import Access
+from master_server.cell_loading import CellLoader
 from master_server.master import Master
 from master_server.metrics import Metrics
 from master_server.recording import Recorder
@@ -21,7 +22,7 @@ from master_server.routes.update import UpdateEndpoint
 from master_server.stream import Stream
 from shared.clock import monotonic_ns
 from shared.configuration import sentence_of
-from shared.errors import CellwatchError, InputError, Refusal, WireError
+from shared.errors import CellError, CellwatchError, InputError, Refusal, WireError
 
 
 class Application(FastAPI):
@@ -61,6 +62,7 @@ def make_app(master: Master, access: Access, recorder: Recorder | None = None) -
             Refusal: _refused,
             InputError: _refused,
             WireError: _refused,
+            CellError: _refused,
             RequestValidationError: _invalid,
         },
         routes=[Route("/update", update, methods=["POST"])],
@@ -69,6 +71,7 @@ def make_app(master: Master, access: Access, recorder: Recorder | None = None) -
     app.update = update
     app.state.master = master
     app.state.access = access
+    app.state.loader = CellLoader()
     app.state.stream = listeners
     app.state.recorder = recorder
     app.state.metrics = metrics

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 
 from master_server.coverage import Coverage, blocks_of
 from master_server.merge import NO_KEYS, MergedMap
+from master_server.published import PublishedCell
 from master_server.registry import Registry, Slot
 from master_server.robot import RobotJoints
 from shared.cell import Cell
@@ -25,7 +26,7 @@ from shared.errors import Refusal
 from shared.lattice import Lattice
 from shared.messages import (
     CONTRACT_VERSION,
-    CellReference,
+    CellAnswer,
     Command,
     InitializeAnswer,
     InitializeRequest,
@@ -71,15 +72,19 @@ class Master:
 
     def __init__(self, cell: Cell, settings: Settings) -> None:
         """Raises InputError when the cell needs too many voxels of the size in `settings`."""
-        self.cell = cell
+        self.published = PublishedCell.of(cell)
         self.settings = settings
         self.versions = Versions(settings=1, lattice=1, cell=1)
         self.registry = Registry()
         self.robot = RobotJoints(cell.robot.joint_names if cell.robot else None)
         self.listeners: list[Callable[[], None]] = []
         """Called after each change of what `view` says; time alone changes it too, see `next_change_ns`."""
-        self._documents()
         self._begin_on(cell.lattice(settings.voxel_size_m), blocks_of(cell, settings.seen_block_size_m))
+
+    @property
+    def cell(self) -> Cell:
+        """The cell that is watched."""
+        return self.published.cell
 
     # ------------------------------------------------------------------ units
 
@@ -101,9 +106,9 @@ class Master:
             versions=self._versions_for(slot),
             settings=self.settings,
             lattice=self.lattice_description,
-            cell=self.cell_reference,
+            cell=self.published.reference,
             T_world_camera=slot.T_world_camera,
-            board=self.cell_document["board"],
+            board=self.published.document["board"],
             joints=self.robot.since(0),
             received_at_ns=now_ns,
             answered_at_ns=now_ns,
@@ -123,7 +128,7 @@ class Master:
             raise Refusal(409, f"unit {slot.id}: expected a sequence above {slot.sequence}, got {update.sequence}")
         on_lattice = update.versions.lattice == self.versions.lattice
         keys = keys_from_bytes(update.keys, self.lattice.cell_count) if on_lattice else NO_KEYS
-        if update.seen is not None and update.versions.settings == self.versions.settings:
+        if update.seen is not None and update.versions == self._versions_for(slot):
             self.coverage.report(slot.id, update.seen)
         self._take_in(slot, update, keys, now_ns)
         if self.judge(slot, now_ns)[0] == "live":
@@ -271,15 +276,59 @@ class Master:
         self._changed()
         return settings
 
+    def change_cell(self, cell: Cell | PublishedCell) -> CellAnswer:
+        """Watch another cell from now on. Every unit learns of it with the answer to its next update, and is not live
+        until it works with it.
+
+        The robot's joints are kept if the robot is the same.
+
+        Raises:
+            InputError: the cell would need too many voxels; the old one stays.
+            CellError: a mesh is absurdly large and does not touch the box; the old one stays.
+        """
+        published = cell if isinstance(cell, PublishedCell) else PublishedCell.of(cell)
+        lattice = published.cell.lattice(self.settings.voxel_size_m)
+        blocks = blocks_of(published.cell, self.settings.seen_block_size_m)
+        if published.reference == self.published.reference:
+            return self.cell_answer
+        if published.document["robot"] != self.published.document["robot"]:
+            robot = published.cell.robot
+            self.robot = RobotJoints(robot.joint_names if robot else None)
+        self.published = published
+        self.versions = self.versions.model_copy(
+            update={
+                "cell": self.versions.cell + 1,
+                "lattice": self.versions.lattice + (lattice != self.lattice),
+            }
+        )
+        # Whatever was reported was made with the old cell.
+        self._begin_on(lattice, blocks)
+        logger.info("cell %s: version %d, %s", published.cell.name, self.versions.cell, published.reference.sha256[:8])
+        self._changed()
+        return self.cell_answer
+
+    def move_object(self, name: str, T_world_object: Matrix) -> CellAnswer:
+        """A known object stands elsewhere from now on; otherwise as `change_cell`.
+
+        Raises:
+            Refusal: 404, no object has this name.
+            InputError: the pose is no rigid transform.
+        """
+        names = [body.name for body in self.cell.objects]
+        if name not in names:
+            raise Refusal(404, f"object {name}: not in this cell; its objects are {', '.join(names) or 'none'}")
+        return self.change_cell(self.published.with_object_pose(name, T_world_object))
+
+    @property
+    def cell_answer(self) -> CellAnswer:
+        """Which cell is watched now."""
+        return CellAnswer(cell=self.published.reference, versions=self.versions)
+
     # ------------------------------------------------------------------ inside
 
     def _changed(self) -> None:
         for listener in self.listeners:
             listener()
-
-    def _documents(self) -> None:
-        self.cell_document, self.meshes = self.cell.to_document()
-        self.cell_reference = CellReference(name=self.cell.name, sha256=self.cell.version)
 
     def _begin_on(self, lattice: Lattice, blocks: Lattice) -> None:
         """Begin on another lattice and blocks; all that was reported is void."""
@@ -325,7 +374,7 @@ class Master:
         if current.settings != theirs.settings or current.lattice != theirs.lattice:
             changed |= {"settings": self.settings, "lattice": self.lattice_description}
         if current.cell != theirs.cell:
-            changed["cell"] = self.cell_reference
+            changed["cell"] = self.published.reference
         if current.pose != theirs.pose:
             changed["T_world_camera"] = slot.T_world_camera
         return answer.model_copy(update=changed)

@@ -74,7 +74,7 @@ def moment_of(master: Master, now_ns: int) -> Moment:
         master.robot_answer(0, now_ns),
         master.settings,
         master.cell,
-        master.cell_reference,
+        master.published.reference,
     )
 
 

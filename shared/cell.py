@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from shared.cell_file import MAX_BODIES, BoardFile, DHFile, RobotFile, ShapeFile, named_file, read_cell_file
+from shared.cell_file import MAX_BODIES, BoardFile, DHFile, Name, RobotFile, ShapeFile, named_file, read_cell_file
 from shared.configuration import sentence
 from shared.errors import CellError, InputError, KinematicsError, MeshError
 from shared.joint_table import DHJoint
 from shared.kinematics import Robot
 from shared.lattice import Lattice
-from shared.meshes import TriangleMesh, box_mesh, cylinder_mesh, load_mesh, mesh_by_hash
+from shared.meshes import MAX_COORDINATE_M, TriangleMesh, box_mesh, cylinder_mesh, load_mesh, mesh_by_hash
 from shared.transforms import Transform, validated
 
 
@@ -35,6 +35,11 @@ class PlacedMesh:
 
     def __post_init__(self) -> None:
         pose = validated(self.T_world_mesh, f"{self.name} T_world_mesh")
+        farthest_m = float(np.abs(pose[:3, 3]).max())
+        if farthest_m > MAX_COORDINATE_M:
+            raise InputError(
+                f"{self.name} T_world_mesh: expected a place within {MAX_COORDINATE_M:g} m, got {farthest_m:.4g} m"
+            )
         pose.flags.writeable = False
         object.__setattr__(self, "T_world_mesh", pose)
 
@@ -181,41 +186,58 @@ class Cell:
     @cached_property
     def version(self) -> str:
         """Hash of all that the cell says, as hex: equal cells, equal versions."""
-        document, _ = self.to_document()
-        return hashlib.sha256(json.dumps(document, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+        text = json.dumps(self.document(), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
 
-    def to_document(self) -> tuple[dict[str, Any], dict[str, bytes]]:
-        """The cell as a plain document, and its meshes' canonical bytes by sha256."""
-        robot, meshes = (None, {}) if self.robot is None else self.robot.to_document()
-        for body in (*self.static, *self.objects):
-            meshes[body.mesh.sha256] = body.mesh.to_bytes()
-        document: dict[str, Any] = {
+    @property
+    def meshes(self) -> dict[str, TriangleMesh]:
+        """All meshes by sha256, each once."""
+        links = [] if self.robot is None else [link.mesh for link in self.robot.links]
+        bodies = [body.mesh for body in (*self.static, *self.objects)]
+        return {mesh.sha256: mesh for mesh in (*links, *bodies)}
+
+    def document(self) -> dict[str, Any]:
+        """The cell as a plain document that names its meshes by sha256."""
+        return {
             "name": self.name,
             "box_min_m": self.box_min_m.tolist(),
             "box_max_m": self.box_max_m.tolist(),
             "static": [_body_document(body) for body in self.static],
             "objects": [_body_document(body) for body in self.objects],
-            "robot": robot,
+            "robot": None if self.robot is None else self.robot.document(),
             "board": None if self.board is None else self.board.to_document(),
         }
-        return document, meshes
+
+    def to_document(self) -> tuple[dict[str, Any], dict[str, bytes]]:
+        """The cell as a plain document, and its meshes' canonical bytes by sha256."""
+        return self.document(), {sha256: mesh.to_bytes() for sha256, mesh in self.meshes.items()}
 
     @classmethod
-    def from_document(cls, document: object, meshes: Mapping[str, bytes]) -> Cell:
+    def from_document(cls, document: object, meshes: Mapping[str, bytes], like: Cell | None = None) -> Cell:
         """The cell of `to_document`, as it came over the network.
+
+        What is equal in the cell `like`, meshes and robot, is taken from there: the same objects, and `meshes` need
+        not hold them.
 
         Raises:
             CellError: the document is malformed, or a mesh is missing or not what its hash says.
         """
         try:
             checked = _CellDocument.model_validate(document)
+            # Each is read once, however many bodies share it.
+            known: dict[str, bytes | TriangleMesh] = {**meshes, **(like.meshes if like else {})}
+            static = tuple(_placed(body, known) for body in checked.static)
+            objects = tuple(_placed(body, known) for body in checked.objects)
+            robot = None if checked.robot is None else Robot.from_document(checked.robot, known)
+            if like is not None and like.robot is not None and robot is not None:
+                robot = like.robot if like.robot.document() == robot.document() else robot
             return cls(
                 checked.name,
                 np.array(checked.box_min_m),
                 np.array(checked.box_max_m),
-                tuple(_placed(body, meshes) for body in checked.static),
-                tuple(_placed(body, meshes) for body in checked.objects),
-                None if checked.robot is None else Robot.from_document(checked.robot, meshes),
+                static,
+                objects,
+                robot,
                 None if checked.board is None else Board.from_document(checked.board),
             )
         except ValidationError as error:
@@ -229,7 +251,7 @@ class _DocumentModel(BaseModel):
 
 
 class _BodyDocument(_DocumentModel):
-    name: str
+    name: Name
     mesh: str
     T_world_mesh: list[list[float]]
 
@@ -246,7 +268,7 @@ class _BoardDocument(_DocumentModel):
 
 
 class _CellDocument(_DocumentModel):
-    name: str
+    name: Name
     box_min_m: tuple[float, float, float]
     box_max_m: tuple[float, float, float]
     static: list[_BodyDocument] = Field(max_length=MAX_BODIES)
@@ -259,9 +281,10 @@ def _body_document(body: PlacedMesh) -> dict[str, Any]:
     return {"name": body.name, "mesh": body.mesh.sha256, "T_world_mesh": body.T_world_mesh.tolist()}
 
 
-def _placed(body: _BodyDocument, meshes: Mapping[str, bytes]) -> PlacedMesh:
+def _placed(body: _BodyDocument, known: dict[str, bytes | TriangleMesh]) -> PlacedMesh:
     pose = validated(body.T_world_mesh, f"{body.name} T_world_mesh")
-    return PlacedMesh(body.name, mesh_by_hash(meshes, body.mesh, body.name), pose)
+    mesh = known[body.mesh] = mesh_by_hash(known, body.mesh, body.name)
+    return PlacedMesh(body.name, mesh, pose)
 
 
 def _shape(file: Path, key: str, shape: ShapeFile, name: str) -> TriangleMesh:

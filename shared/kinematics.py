@@ -282,9 +282,9 @@ class Robot:
         except KinematicsError as error:
             raise KinematicsError(f"{path}: {error}") from error
 
-    def to_document(self) -> tuple[dict[str, Any], dict[str, bytes]]:
-        """The robot as a plain document, and its meshes' canonical bytes by sha256."""
-        document = {
+    def document(self) -> dict[str, Any]:
+        """The robot as a plain document that names its meshes by sha256."""
+        return {
             "name": self.name,
             "joint_names": list(self.joint_names),
             "T_world_base": self.T_world_base.tolist(),
@@ -310,10 +310,13 @@ class Robot:
                 for item in self._attachments
             ],
         }
-        return document, {link.mesh.sha256: link.mesh.to_bytes() for link in self.links}
+
+    def to_document(self) -> tuple[dict[str, Any], dict[str, bytes]]:
+        """The robot as a plain document, and its meshes' canonical bytes by sha256."""
+        return self.document(), {link.mesh.sha256: link.mesh.to_bytes() for link in self.links}
 
     @classmethod
-    def from_document(cls, document: object, meshes: Mapping[str, bytes]) -> Robot:
+    def from_document(cls, document: object, meshes: Mapping[str, bytes | TriangleMesh]) -> Robot:
         """The robot of `to_document`, as it came over the network.
 
         Raises:
@@ -322,6 +325,11 @@ class Robot:
         """
         try:
             checked = _RobotDocument.model_validate(document)
+            # Each is read once, however many frames carry it.
+            known = dict(meshes)
+            for row in checked.frames:
+                if row.mesh is not None:
+                    known[row.mesh] = mesh_by_hash(known, row.mesh, row.name)
             return cls(
                 checked.name,
                 checked.joint_names,
@@ -342,7 +350,7 @@ class Robot:
                         row.name,
                         row.body,
                         validated(row.T_body_frame, "T_body_frame"),
-                        None if row.mesh is None else mesh_by_hash(meshes, row.mesh, row.name),
+                        None if row.mesh is None else mesh_by_hash(known, row.mesh, row.name),
                     )
                     for row in checked.frames
                 ],

@@ -210,15 +210,16 @@ def load_mesh(path: str | Path, scale: float | Sequence[float] = 1.0, name: str 
         raise MeshError(f"{file}: {error}") from error
 
 
-def mesh_by_hash(meshes: Mapping[str, bytes], sha256: str, name: str) -> TriangleMesh:
-    """The mesh `name` out of canonical bytes that are filed under their hashes.
+def mesh_by_hash(meshes: Mapping[str, bytes | TriangleMesh], sha256: str, name: str) -> TriangleMesh:
+    """The mesh `name` out of canonical bytes, or meshes read before, that are filed under their hashes.
 
     Raises:
         MeshError: it is missing, its bytes have another hash, or they are malformed.
     """
     if sha256 not in meshes:
         raise MeshError(f"mesh {name}: expected bytes with sha256 {sha256}, got none")
-    mesh = TriangleMesh.from_bytes(meshes[sha256], name)
+    found = meshes[sha256]
+    mesh = found if isinstance(found, TriangleMesh) else TriangleMesh.from_bytes(found, name)
     if mesh.sha256 != sha256:
         raise MeshError(f"mesh {name}: expected bytes with sha256 {sha256}, got {mesh.sha256}")
     return mesh

@@ -115,6 +115,25 @@ class CellReference(Message):
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
+class CellAnswer(Message):
+    """What a change of the cell led to: the cell that is watched now, and the versions that units must work with."""
+
+    cell: CellReference
+    versions: Versions
+
+
+class ObjectPoseRequest(Message):
+    """Where a known object stands now: `T_world_object` (4, 4), its mesh's frame in the world."""
+
+    T_world_object: Matrix
+
+    @field_validator("T_world_object")
+    @classmethod
+    def _rigid(cls, value: Matrix) -> Matrix:
+        validated(value, "T_world_object")
+        return value
+
+
 class JointSample(NamedTuple):
     """The robot's joints at one time by the master's clock: positions (n,) rad (m if prismatic), velocities per s."""
 

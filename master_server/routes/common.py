@@ -17,7 +17,7 @@ from starlette.types import Message, Scope
 from master_server.access import ANYONE, OPERATORS, UNITS, Access, Role
 from master_server.master import Master
 from shared.errors import Refusal, WireError
-from shared.waiting import at_once_or_within
+from shared.waiting import at_once_or_within, within
 from shared.wire import MEDIA_TYPE, unpack
 
 MAX_BODY_BYTES = 2**18
@@ -36,9 +36,7 @@ async def body_of(request: Request, max_bytes: int) -> bytes:
     Raises:
         Refusal: 413, more than `max_bytes`; 408, it came too slowly; 400, the sender went away.
     """
-    declared = request.headers.get("content-length", "0")
-    if declared.isdigit() and int(declared) > max_bytes:
-        raise Refusal(413, f"body: expected at most {max_bytes} bytes, got {declared}")
+    _check_declared(request, max_bytes)
     body = bytearray()
     try:
         if not await at_once_or_within(BODY_TIMEOUT_S, _read(request, max_bytes, body)):
@@ -46,6 +44,32 @@ async def body_of(request: Request, max_bytes: int) -> bytes:
     except ClientDisconnect as error:
         raise Refusal(400, "body: the sender went away") from error
     return bytes(body)
+
+
+async def pour(
+    request: Request, max_bytes: int, timeout_s: float, add: Callable[[bytes], Coroutine[Any, Any, None]]
+) -> None:
+    """Hand a large body on as it comes.
+
+    Raises:
+        Refusal: as in `body_of`.
+    """
+    _check_declared(request, max_bytes)
+    count = 0
+
+    async def read() -> None:
+        nonlocal count
+        async for chunk in request.stream():
+            count += len(chunk)
+            if count > max_bytes:
+                raise Refusal(413, f"body: expected at most {max_bytes} bytes, got more")
+            await add(chunk)
+
+    try:
+        if not await within(timeout_s, read()):
+            raise Refusal(408, f"body: expected all of it within {timeout_s:g} s, got {count} bytes")
+    except ClientDisconnect as error:
+        raise Refusal(400, "body: the sender went away") from error
 
 
 def ip_of(scope: Scope) -> str:
@@ -129,6 +153,12 @@ MasterDependency = Annotated[Master, Depends(master_of)]
 READERS = [bearer, Depends(may_read)]
 OPERATOR_ONLY = [bearer, Depends(is_operator)]
 UNIT_ONLY = [bearer, Depends(is_unit)]
+
+
+def _check_declared(request: Request, max_bytes: int) -> None:
+    declared = request.headers.get("content-length", "0")
+    if declared.isdigit() and int(declared) > max_bytes:
+        raise Refusal(413, f"body: expected at most {max_bytes} bytes, got {declared}")
 
 
 async def _read(request: Request, max_bytes: int, body: bytearray) -> None:

@@ -198,6 +198,8 @@ DOORS = [
     ("GET", "/settings", 401, 200, 200),
     ("GET", "/cell", 401, 200, 200),
     ("GET", "/robot", 401, 200, 200),
+    ("PUT", "/cell", 401, 403, 415),
+    ("PUT", "/cell/objects/{name}/pose", 401, 403, 422),
     ("GET", f"/cell/meshes/{'0' * 64}", 401, 404, 404),
     ("PUT", "/settings", 401, 403, 422),
     ("PUT", "/units/1/pose", 401, 422, 422),
@@ -374,7 +376,7 @@ async def test_the_cell_and_its_meshes(desk: Desk) -> None:
     assert response.headers["etag"] == f'"{unit.initialized.cell.sha256}"'
     sha256 = next(frame["mesh"] for frame in document["robot"]["frames"] if frame["mesh"])
     mesh = await desk.call("GET", f"/cell/meshes/{sha256}", UNIT)
-    assert mesh.content == desk.app.state.master.meshes[sha256]
+    assert mesh.content == desk.app.state.master.published.meshes[sha256]
     assert "immutable" in mesh.headers["cache-control"]
 
 

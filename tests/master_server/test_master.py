@@ -10,9 +10,11 @@ from hypothesis import strategies as st
 
 from master_server.master import Master
 from master_server.registry import COMMAND_EXPIRES_S, FPS_FRAMES, MAX_UNITS
+from shared.cell import Cell
 from shared.errors import InputError, Refusal, WireError
 from shared.lattice import Lattice
 from shared.messages import CONTRACT_VERSION, DONE, MAX_COMMANDS, CommandRow, Health, JointsRequest, Outcome, Versions
+from shared.settings import Settings
 from shared.timebase import Exchange
 from tests.master_server.fakes import AT_ORIGIN, GOOD, MS, START_NS, FakeUnit, S, joined, master, sees_all
 
@@ -421,8 +423,7 @@ def test_settings_out_of_range_are_refused_by_name(changes: dict[str, Any], word
 
 
 def test_a_lattice_that_would_be_too_large_changes_nothing() -> None:
-    one = master()
-    one.cell = type(one.cell)("huge", np.zeros(3), np.array([200.0, 200.0, 20.0]))
+    one = Master(Cell("huge", np.zeros(3), np.array([20.0, 20.0, 10.0])), Settings())
     with pytest.raises(InputError, match="larger voxels"):
         one.change_settings({"voxel_size_m": 0.01})
     assert one.settings.voxel_size_m == 0.05

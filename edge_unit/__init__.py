@@ -17,12 +17,14 @@ In the order of the flow:
     voxels          foreground pixels become voxels of the lattice (Algorithms 1, 6 and 7)
     visibility      which blocks of the cell a frame looks through
     health          does what the camera sees still fit what it should see
+    misfit          how badly a frame fits from where the camera should be, and from close by
     pipeline        the method, one line a stage
     joints          the robot's joints at a frame's time
     client          what a unit can ask the master
     cell_cache      the master's cell, kept on disk
     uplink          the exchange with the master: latest wins
     background      the learned reference, kept on disk
+    stance          does the camera still stand where its pose was found
     camera_memory   the camera that was here, so that its absence can be told
     trace           what was reported, frame by frame, in a file
     config          the unit's own configuration

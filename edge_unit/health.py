@@ -40,26 +40,20 @@ class HealthCheck:
         self._intrinsics = intrinsics
         self._bins = np.zeros(agreement.RESIDUAL_BINS, np.int64)
         self._tallies = np.zeros(4, np.int64)
-        self._source: NDArray[np.float32] | None = None
-        self._static_raw = np.zeros(intrinsics.shape, np.uint16)
 
     def check(
         self,
         depth_raw: NDArray[np.uint16],
-        static_depth_m: NDArray[np.float32],
+        static_raw: NDArray[np.uint16],
         robot_near_raw: NDArray[np.uint16],
         settings: FilterSettings,
     ) -> Health:
-        """Compare a frame (H, W) with the static surfaces (H, W) in metres, inf where nothing is known."""
+        """Compare a frame (H, W) with the static surfaces (H, W), 0 where nothing is known, all raw."""
         scale_m = self._intrinsics.depth_scale_m
-        if static_depth_m is not self._source:
-            raw = np.nan_to_num(static_depth_m / scale_m, nan=0.0, posinf=0.0)
-            self._static_raw = np.where(raw < 65535.0, raw, 0.0).astype(np.uint16)
-            self._source = static_depth_m
         noise_per_m = self._intrinsics.disparity_noise_m(settings.stereo_subpixel_px)
         agreement.compare(
             depth_raw,
-            self._static_raw,
+            static_raw,
             robot_near_raw,
             settings.margin_base_m / scale_m,
             settings.margin_noise_gain * noise_per_m * scale_m,

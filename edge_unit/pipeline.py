@@ -15,6 +15,7 @@ from edge_unit.halo import EdgeHalo
 from edge_unit.health import Health, HealthCheck
 from edge_unit.kernels import foreground, limits
 from edge_unit.links import Links
+from edge_unit.misfit import Misfit, MisfitCheck
 from edge_unit.reference import Reference, ReferenceLearner
 from edge_unit.visibility import SeenBlocks, Visibility
 from edge_unit.voxels import Voxelizer, Voxels
@@ -88,6 +89,8 @@ class DepthPipeline:
         self._no_depth_raw = np.zeros(intrinsics.shape, np.uint16)
         self._halo = EdgeHalo(intrinsics)
         self._health = HealthCheck(intrinsics)
+        self._misfit = MisfitCheck(intrinsics)
+        self.static_version = 0
         self.use_cell(cell)
 
     # ------------------------------------------------------------------ what a frame goes through
@@ -149,7 +152,11 @@ class DepthPipeline:
 
     def health(self) -> Health:
         """How well the last frame fits what is known."""
-        return self._health.check(self._depth_raw, self._static_depth_m, self._robot.near_raw, self.settings)
+        return self._health.check(self._depth_raw, self._static_raw, self._robot.near_raw, self.settings)
+
+    def misfit(self) -> Misfit:
+        """How badly the last frame fits what is known, from here and from places close by."""
+        return self._misfit.check(self._depth_raw, self._static_raw, self._robot.near_raw, self.settings)
 
     # ------------------------------------------------------------------ learning the empty cell
 
@@ -346,6 +353,9 @@ class DepthPipeline:
         cad_m = np.full(camera.shape, np.inf, np.float32)
         np.divide(1.0, w, out=cad_m, where=w > 0.0)
         self._static_depth_m = np.fmin(cad_m, reference_m)
+        static_raw = np.nan_to_num(self._static_depth_m / camera.depth_scale_m, nan=0.0, posinf=0.0)
+        self._static_raw = np.where(static_raw < limits.RAW_MAX, static_raw, 0.0).astype(np.uint16)
+        self.static_version += 1
 
     def _look_from(self, T_world_camera: Transform, settings: FilterSettings) -> Visibility:
         return Visibility(

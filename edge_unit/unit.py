@@ -32,6 +32,7 @@ from edge_unit.sources.realsense import RealsenseSource, RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
 from edge_unit.sources.simulated import SimulatedSource
 from edge_unit.sources.status import ReportsStatus
+from edge_unit.stance import Stance, Verdict, place_of
 from edge_unit.trace import Trace, TraceRecord
 from edge_unit.uplink import Assignment, Report, Uplink
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -87,6 +88,7 @@ class Unit:
         self._pose = None if configured is None else (configured.transform(), "configured")
         self._store = BackgroundStore(config.state_dir)
         self._memory = CameraMemory(config.state_dir)
+        self._stance = Stance(config.state_dir)
         self._trace = None if config.trace_path is None else Trace(config.trace_path)
         self._camera: CameraInfo | None = None
         self._pipeline: DepthPipeline | None = None
@@ -264,7 +266,7 @@ class Unit:
                 self._obey(command, pipeline)
             if self._learning is not None:
                 return self._learn(self._learning, pipeline, assignment, frame, joints)
-            return _report(pipeline, assignment, frame, joints)
+            return self._report(pipeline, assignment, frame, joints)
         except InputError as error:
             logger.warning("frame %d: %s", frame.frame_number, error)
             return _troubled(assignment, frame, str(error))
@@ -292,6 +294,9 @@ class Unit:
 
     def _find_background(self, pipeline: DepthPipeline) -> None:
         """What was learned at this place before, or else begin to learn if the configuration says so."""
+        camera = self._camera
+        assert camera is not None
+        self._stance.begin(place_of(camera.serial, camera.intrinsics.shape, pipeline.T_world_camera))
         self._end_learning("the camera's pose changed meanwhile")
         stored = self._store.load(self._place(pipeline))
         if stored is not None:
@@ -341,7 +346,46 @@ class Unit:
         self._store.save(self._place(pipeline), reference)
         self._end_learning(DONE)
         logger.info("learned the background from %d frames: %.0f %% of it", done, 100.0 * reference.learned_share)
-        return _report(pipeline, assignment, frame, joints)
+        return self._report(pipeline, assignment, frame, joints)
+
+    def _report(
+        self, pipeline: DepthPipeline, assignment: Assignment, frame: DepthFrame, joints: JointEstimate | None
+    ) -> Report:
+        """What a frame shows, and whether its camera can be trusted."""
+        if joints is None:
+            voxels = pipeline.process(frame.depth, None)
+        else:
+            voxels = pipeline.process(frame.depth, joints.positions, joint_uncertainty_rad=joints.uncertainty)
+        if len(voxels) > MAX_VOXELS:
+            return _troubled(assignment, frame, f"{len(voxels)} obstacle voxels, more than an update can hold")
+        health, stance = pipeline.health(), self._judge(pipeline, frame)
+        return Report(
+            assignment,
+            frame.captured_at_ns,
+            keys_to_bytes(voxels.keys),
+            pipeline.seen(),
+            Health(
+                valid_share=health.valid_share,
+                agreeing_share=health.agreeing_share,
+                residual_share=health.residual_share,
+                static_share=health.static_share,
+                process_ms=round(pipeline.last.total_ns / NS_PER_MS, 3),
+                frame=frame.frame_number,
+                moved=stance.moved or None,
+                blind=stance.blind or None,
+                warning=stance.warning or None,
+            ),
+        )
+
+    def _judge(self, pipeline: DepthPipeline, frame: DepthFrame) -> Verdict:
+        """Whether the camera still stands where it stood, and sees."""
+        stance = self._stance
+        if not stance.due(frame.captured_at_ns):
+            return stance.verdict
+        before, verdict = stance.verdict, stance.judge(pipeline.misfit(), pipeline.static_version, frame.captured_at_ns)
+        if bool(verdict.reason) != bool(before.reason):
+            logger.warning("%s", verdict.reason or "the camera stands where it stood, and sees")
+        return verdict
 
     def _place(self, pipeline: DepthPipeline) -> Place:
         assert self._camera is not None
@@ -394,34 +438,11 @@ def _warm_up(pipeline: DepthPipeline) -> None:
     joints = None if robot is None else np.zeros(robot.joint_count)
     pipeline.process(np.zeros(pipeline.intrinsics.shape, np.uint16), joints)
     pipeline.health()
+    pipeline.misfit()
     pipeline.seen()
     # What is there now stays; without this, each full collection looks through it, and a frame waits 0.1 s.
     gc.collect()
     gc.freeze()
-
-
-def _report(pipeline: DepthPipeline, assignment: Assignment, frame: DepthFrame, joints: JointEstimate | None) -> Report:
-    if joints is None:
-        voxels = pipeline.process(frame.depth, None)
-    else:
-        voxels = pipeline.process(frame.depth, joints.positions, joint_uncertainty_rad=joints.uncertainty)
-    if len(voxels) > MAX_VOXELS:
-        return _troubled(assignment, frame, f"{len(voxels)} obstacle voxels, more than an update can hold")
-    health = pipeline.health()
-    return Report(
-        assignment,
-        frame.captured_at_ns,
-        keys_to_bytes(voxels.keys),
-        pipeline.seen(),
-        Health(
-            valid_share=health.valid_share,
-            agreeing_share=health.agreeing_share,
-            residual_share=health.residual_share,
-            static_share=health.static_share,
-            process_ms=round(pipeline.last.total_ns / NS_PER_MS, 3),
-            frame=frame.frame_number,
-        ),
-    )
 
 
 def _troubled(assignment: Assignment, frame: DepthFrame, trouble: str) -> Report:

@@ -180,8 +180,12 @@ class Slot:
         health = self.health
         if health.trouble:
             return "blind", health.trouble
+        if health.blind:
+            return "blind", health.blind
         if health.valid_share < BLIND_VALID_SHARE:
             return "blind", f"only {health.valid_share:.0%} of its pixels measure anything"
+        if health.moved:
+            return "moved", health.moved
         if health.static_share >= MOVED_STATIC_SHARE and health.agreeing_share < MOVED_AGREEING_SHARE:
             return "moved", f"only {health.agreeing_share:.0%} of the known surfaces are where they should be"
         return "live", health.warning or ""

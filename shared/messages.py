@@ -216,6 +216,8 @@ class Health(Message):
     frame: Counter = Field(default=0, description="Number of the frame.")
     trouble: Text | None = Field(default=None, description="What is wrong at the unit, in one sentence.")
     warning: Text | None = Field(default=None, description="What is worse than it need be, though it works.")
+    moved: Text | None = Field(default=None, description="Why the camera seems to stand elsewhere than its pose says.")
+    blind: Text | None = Field(default=None, description="Why the camera seems covered or dazzled.")
 
 
 class UpdateRequest(Message):

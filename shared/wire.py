@@ -9,7 +9,7 @@ The body of `/update` is a msgpack map of the fields of `UpdateRequest` that are
     versions                            array of 4 small integers, 5 to 13 bytes
     keys                                binary, 4 bytes a voxel: ascending little-endian uint32
     seen                                map, only when it changed: at most 4 kB (see `pack_seen`)
-    health                              array of 8 values, some 50 bytes
+    health                              array of 10 values, some 50 bytes
 
 and its answer those of `UpdateAnswer`, where each joint sample is `[at_ns, positions, velocities]`
 with little-endian float32 as binary. `versions` and `health` are the values of their fields in order: at 30 updates a

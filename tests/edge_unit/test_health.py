@@ -16,7 +16,7 @@ SETTINGS = FilterSettings()
 
 
 def check(depth: Depth, static_m: NDArray[np.float32] = WALL_M, robot: NDArray[np.uint16] = NO_ROBOT) -> Health:
-    return HealthCheck(CAMERA).check(depth, static_m, robot, SETTINGS)
+    return HealthCheck(CAMERA).check(depth, measured(static_m, CAMERA), robot, SETTINGS)
 
 
 def test_a_camera_that_sees_what_it_should() -> None:

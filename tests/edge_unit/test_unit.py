@@ -276,13 +276,13 @@ async def test_another_master_never_gets_voxels_of_the_first_ones_lattice(tmp_pa
 async def test_joints_of_the_frames_time_reach_the_pipeline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = await asyncio.to_thread(Bench, tmp_path, with_robot=True)
     used: list[Any] = []
-    process = unit_module._report
+    report = unit_module.Unit._report
 
-    def spy(pipeline: Any, assignment: Any, frame: Any, joints: Any) -> Any:
+    def spy(unit: Any, pipeline: Any, assignment: Any, frame: Any, joints: Any) -> Any:
         used.append(joints)
-        return process(pipeline, assignment, frame, joints)
+        return report(unit, pipeline, assignment, frame, joints)
 
-    monkeypatch.setattr(unit_module, "_report", spy)
+    monkeypatch.setattr(unit_module.Unit, "_report", spy)
     async with bench.running():
         bench.show(patch(FAR_MM))
         await bench.until(lambda: used, "a frame without joints")

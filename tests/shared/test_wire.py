@@ -98,7 +98,7 @@ def test_the_names_on_the_wire_are_those_of_the_contract() -> None:
         "joints_until_ns", "done",
     ]  # fmt: skip
     assert fields["versions"] == [1000, 1000, 1000, 1000]
-    assert fields["health"] == [0.87, 0.95, -0.01, 0.5, 8.1, 10**7, None, None]
+    assert fields["health"] == [0.87, 0.95, -0.01, 0.5, 8.1, 10**7, None, None, None, None]
     assert fields["keys"][:8] == b"\x05\x00\x00\x00\x06\x00\x00\x00"
 
 
@@ -202,10 +202,10 @@ def test_bad_seen_reports_are_refused(shape: tuple[int, int, int], bits: bytes) 
         ({"versions": [1, 1, 1]}, "versions: expected an array of 4 values"),
         ({"versions": {"settings": 1, "lattice": 1}}, "versions: expected an array of 4 values"),
         ({"versions": None}, "versions: expected an array of 4 values"),
-        ({"health": [float("nan"), 0.5, 0.0, 0.5, 1.0, 1, None, None]}, "health.valid_share"),
-        ({"health": [1.1, 0.5, 0.0, 0.5, 1.0, 1, None, None]}, "health.valid_share"),
-        ({"health": [0.5, 0.5, 0.0, 0.5, 1.0, 1, "x" * 201, None]}, "health.trouble"),
-        ({"health": [0.5] * 9}, "health: expected an array of 8 values"),
+        ({"health": [float("nan"), 0.5, 0.0, 0.5, 1.0, 1, None, None, None, None]}, "health.valid_share"),
+        ({"health": [1.1, 0.5, 0.0, 0.5, 1.0, 1, None, None, None, None]}, "health.valid_share"),
+        ({"health": [0.5, 0.5, 0.0, 0.5, 1.0, 1, "x" * 201, None, None, None]}, "health.trouble"),
+        ({"health": [0.5] * 9}, "health: expected an array of 10 values"),
         ({"seen": {"block_size_m": 0.1, "shape": [1, 1, 0], "bits": b""}}, "seen.shape"),
         ({"seen": {"block_size_m": 0.1, "shape": [1, 1, 1], "bits": b"x" * (MAX_SEEN_BYTES + 1)}}, "seen.bits"),
         ({"done": list(range(17))}, "done"),

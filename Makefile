@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps source-faults bench-pipeline pictures test lint clean libusb
+.PHONY: help demo real sweeps source-faults bench-pipeline bench-master pictures test lint clean libusb
 
 ARGS ?=
 EXTRAS := edge,master,realsense,sim,dev
@@ -37,6 +37,9 @@ source-faults: $(READY) libusb ## a RealSense camera that hangs, dies and is unp
 
 bench-pipeline: $(BENCH_READY) libusb ## what a frame costs, beside Open3D, OctoMap and Embree on the same frames
 	@$(BIN)/python -m benchmarks.pipeline $(ARGS)
+
+bench-master: $(READY) ## how many units one master bears, beside a bare route of FastAPI
+	@$(BIN)/python -m benchmarks.master $(ARGS)
 
 pictures: $(READY) ## the pictures of the README, painted anew
 	@$(BIN)/python -m simulation.picture assets/pictures/demo.png

@@ -21,6 +21,7 @@ import socket
 import sys
 from collections import deque
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -202,6 +203,11 @@ class Generator:
                 raise MasterRefused(f"the master said {answer[0]}: {answer[2]!r}", answer[0])
             connection.unit.take(answer[2], monotonic_ns())
 
+    def close(self) -> None:
+        """Close all connections."""
+        for connection in self._connections:
+            connection.socket.close()
+
     def _cpu_s(self) -> float:
         if self._plan.pid is None:
             return 0.0
@@ -303,12 +309,12 @@ def carry_out(plan: Plan) -> dict[str, Any]:
     token = Path(plan.token_file).read_text(encoding="ascii").strip()
     units = asyncio.run(registered(plan, token))
     try:
-        generator = Generator(plan, units)
-        tally = generator.run()
-        wrong = ""
-        if not plan.bare:
-            generator.send_all()
-            wrong = map_is_right(plan, token, units)
+        with closing(Generator(plan, units)) as generator:
+            tally = generator.run()
+            wrong = ""
+            if not plan.bare:
+                generator.send_all()
+                wrong = map_is_right(plan, token, units)
     except OSError as error:
         raise MasterUnreachable(f"{plan.url}: {error}") from error
     trips_ms = np.array(tally.trips_ms or [np.nan])

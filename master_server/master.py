@@ -380,4 +380,5 @@ class Master:
         return answer.model_copy(update=changed)
 
     def _versions_for(self, slot: Slot) -> Versions:
-        return self.versions.model_copy(update={"pose": slot.pose_version})
+        ours = self.versions
+        return Versions(settings=ours.settings, lattice=ours.lattice, cell=ours.cell, pose=slot.pose_version)

@@ -20,6 +20,7 @@ in the answer, stay within 4 bytes a voxel + 800.
 from __future__ import annotations
 
 import math
+import struct
 import zlib
 from operator import attrgetter
 from typing import Any, TypeVar
@@ -114,9 +115,11 @@ def decode_update(data: bytes) -> UpdateRequest:
     return _validated(UpdateRequest, _named(unpack(data, MAX_UPDATE_BYTES)))
 
 
-def encode_update_answer(answer: UpdateAnswer) -> bytes:
-    """The body of the answer to `POST /update`."""
+def encode_update_answer(answer: UpdateAnswer, answered_at_ns: int | None = None) -> bytes:
+    """The body of the answer to `POST /update`, given at `answered_at_ns` if that is not known before now."""
     fields = answer.model_dump(exclude_defaults=True, exclude={"versions", "joints"})
+    if answered_at_ns is not None:
+        fields["answered_at_ns"] = answered_at_ns
     fields["versions"] = _VALUES["versions"](answer.versions)
     if answer.joints:
         fields["joints"] = [
@@ -217,7 +220,7 @@ def _named(fields: Any) -> Any:
 
 
 def _floats(values: tuple[float, ...]) -> bytes:
-    return np.asarray(values, dtype="<f4").tobytes()
+    return struct.pack(f"<{len(values)}f", *values)
 
 
 def _joint_samples(rows: Any) -> tuple[JointSample, ...]:

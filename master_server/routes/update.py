@@ -48,7 +48,6 @@ class UpdateEndpoint:
         received_at_ns = monotonic_ns()
         update = decode_update(body)
         answer = self._master.update(update, ip_of(request.scope), received_at_ns)
-        answer = answer.model_copy(update={"answered_at_ns": monotonic_ns()})
-        answered = encode_update_answer(answer)
+        answered = encode_update_answer(answer, monotonic_ns())
         self._metrics.accepted(update.id, len(body), monotonic_ns() - received_at_ns)
         return answered

@@ -20,6 +20,7 @@ In the order of the flow:
     misfit          how badly a frame fits from where the camera should be, and from close by
     pipeline        the method, one line a stage
     joints          the robot's joints at a frame's time
+    trust           which master a unit believes, by its certificate
     client          what a unit can ask the master
     cell_cache      the master's cell, kept on disk
     uplink          the exchange with the master: latest wins

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import ssl
 from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any
@@ -11,6 +12,7 @@ from urllib.parse import urlsplit
 
 import httpx
 
+from edge_unit.trust import tls_context
 from shared.errors import ConfigError, MasterRefused, MasterUnreachable, WireError
 from shared.messages import (
     InitializeAnswer,
@@ -51,19 +53,26 @@ class MasterClient:
         read_token: Callable[[], str],
         source_address: str | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         """`read_token` is asked at each registration; `source_address` is an own IP to connect from.
 
-        `transport` carries the requests in place of a network.
+        `transport` carries the requests in place of a network. `tls` is what is asked of the master's certificate,
+        see `trust`; without, a master at https is held against the CAs of the system.
         """
         self.url = url.rstrip("/")
         self._read_token = read_token
         parts = urlsplit(self.url)
         if not parts.hostname:
             raise ConfigError(f"master_url: expected http://host:port, got {url}")
+        if tls is not None and parts.scheme != "https":
+            raise ConfigError(f"master_url: expected https, since the master's certificate is to be checked, got {url}")
+        if transport is None:
+            verify = tls or (tls_context() if parts.scheme == "https" else False)
+            transport = httpx.AsyncHTTPTransport(verify=verify, local_address=source_address, limits=LIMITS)
         self._http = httpx.AsyncClient(
             base_url=self.url,
-            transport=transport or httpx.AsyncHTTPTransport(local_address=source_address, limits=LIMITS),
+            transport=transport,
             timeout=TIMEOUT,
             # No proxy from the environment: the master is on our own network.
             trust_env=False,

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import ssl
 from ipaddress import IPv4Address, IPv6Address
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, SecretStr, field_validator, m
 from edge_unit.sources.realsense import RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSourceConfig, read_pose
 from edge_unit.sources.simulated import SimulatedSourceConfig
+from edge_unit.trust import normalised, tls_context
 from shared.errors import ConfigError
 from shared.transforms import Transform, from_xyz_rpy, validated
 
@@ -78,6 +80,12 @@ class UnitConfig(Configured):
 
     source: SourceConfig
     master_url: str = Field(default=DEFAULT_MASTER_URL, pattern=r"^https?://[^/\s]+/?$")
+    master_ca: Path | None = Field(
+        default=None, description="Certificates (PEM) of the CA that signed the master's; no other master is believed."
+    )
+    master_fingerprint: str | None = Field(
+        default=None, description="sha256 of the master's certificate; no master with another one is believed."
+    )
     token: SecretStr | None = Field(default=None, description="The units' token itself ...")
     token_file: Path | None = Field(default=None, description="... or the file that holds it.")
     state_dir: Path = Field(default_factory=default_state_dir, description="For the cell and the learned background.")
@@ -99,11 +107,37 @@ class UnitConfig(Configured):
             _ = IPv6Address(value) if ":" in value else IPv4Address(value)
         return value
 
+    @field_validator("master_fingerprint")
+    @classmethod
+    def _is_fingerprint(cls, value: str | None) -> str | None:
+        return None if value is None else normalised(value)
+
+    @model_validator(mode="after")
+    def _believed_over_tls_only(self) -> UnitConfig:
+        if self.checks_master and not self.master_url.startswith("https://"):
+            raise ValueError(
+                f"master_url: expected https://, since master_ca or master_fingerprint is set, got {self.master_url}"
+            )
+        return self
+
     @model_validator(mode="after")
     def _one_token(self) -> UnitConfig:
         if self.token is not None and self.token_file is not None:
             raise ValueError("expected token or token_file, got both")
         return self
+
+    @property
+    def checks_master(self) -> bool:
+        """Whether the token goes to one master only, known by its certificate."""
+        return self.master_ca is not None or self.master_fingerprint is not None
+
+    def tls(self) -> ssl.SSLContext | None:
+        """What is asked of the master's certificate; None leaves it to the CAs of the system.
+
+        Raises:
+            ConfigError: `master_ca` cannot be read or holds no certificate.
+        """
+        return tls_context(self.master_ca, self.master_fingerprint) if self.checks_master else None
 
     def read_token(self) -> str:
         """The units' token, read anew each time, so that it can be replaced while the unit runs.

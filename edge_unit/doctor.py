@@ -171,7 +171,12 @@ def stream(info: CameraInfo, measured: Measured, wanted_fps: float | None) -> It
 async def _master(config: UnitConfig) -> AsyncIterator[Finding | Cell]:
     """Whether the master is there and takes our token; the cell that it watches, if it gives it."""
     try:
-        client = MasterClient(config.master_url, config.read_token, config.source_address)
+        tls = await asyncio.to_thread(config.tls)
+        client = MasterClient(config.master_url, config.read_token, config.source_address, tls=tls)
+    except ConfigError as error:
+        yield Finding("FAIL", "master", f"{error}; correct the configuration")
+        return
+    try:
         await asyncio.to_thread(config.read_token)
     except ConfigError as error:
         yield Finding("FAIL", "token", f"{error}; copy the master's unit.token to this board")
@@ -187,7 +192,7 @@ async def _master(config: UnitConfig) -> AsyncIterator[Finding | Cell]:
             yield Finding("FAIL", "token", f"{error}; copy the master's unit.token to this board")
             return
         except CellwatchError as error:
-            yield Finding("FAIL", "master", f"{error}; is it running, and is master_url right?")
+            yield Finding("FAIL", "master", f"{error}; is it running, and are master_url and certificate right?")
             return
         if trip_ms <= ROUND_TRIP_OK_MS:
             yield Finding("ok", "master", f"{client.url} answers within {trip_ms:.1f} ms")

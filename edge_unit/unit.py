@@ -83,7 +83,9 @@ class Unit:
         """
         self._config = config
         self._source = source
-        self._client = client or MasterClient(config.master_url, config.read_token, config.source_address)
+        self._client = client or MasterClient(
+            config.master_url, config.read_token, config.source_address, tls=config.tls()
+        )
         configured = config.T_world_camera
         self._pose = None if configured is None else (configured.transform(), "configured")
         self._store = BackgroundStore(config.state_dir)

@@ -107,6 +107,7 @@ class Uplink:
         self._idle.set()
         self._exchange: Exchange | None = None
         self._acknowledged: tuple[Versions, bytes] | None = None
+        self._complaint = ""
         self._id = 0
         self._sequence = 0
         self._done: list[Outcome] = []
@@ -343,7 +344,10 @@ class Uplink:
 
     async def _wait(self, retry_s: float, error: CellwatchError) -> float:
         """Wait before the next attempt; returns how long to wait after that."""
-        level = logging.WARNING if retry_s == RETRY_MIN_S or isinstance(error, ConfigError) else logging.DEBUG
+        # Once each: a master that is gone, and then one with another certificate.
+        new = retry_s == RETRY_MIN_S or str(error) != self._complaint
+        self._complaint = str(error)
+        level = logging.WARNING if new or isinstance(error, ConfigError) else logging.DEBUG
         logger.log(level, "%s", error)
         await asyncio.sleep(retry_s * random.uniform(0.8, 1.2))
         return min(2.0 * retry_s, RETRY_MAX_S)

@@ -4,6 +4,7 @@
 In the order of the flow:
 
     access       who may do what: two tokens
+    limits       how much one address may ask for
     published    the cell as it is given to units and operators
     unpacking    a cell's folder as a zip becomes a document and its meshes
     cell_loading a new cell is read while units go on
@@ -23,5 +24,6 @@ In the order of the flow:
     routes/      the same as HTTP
     app          the web application, assembled
     websocket    a socket that keeps nothing for who does not read
+    connections  sockets held within bounds: how many, how slow, TLS
     __main__     the command line
 """

@@ -10,6 +10,7 @@ import logging
 import os
 import signal
 import socket
+import ssl
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +21,8 @@ import uvicorn
 from master_server.access import Role, load_access, token_file
 from master_server.app import make_app
 from master_server.config import ENVIRONMENT_PREFIX, MasterConfig
+from master_server.connections import Acceptor, GuardedHttp, fingerprint, quiet, server_context
+from master_server.limits import Limits
 from master_server.master import Master
 from master_server.recording import Recorder
 from master_server.websocket import SERVER_OPTIONS
@@ -55,14 +58,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
 class _Server(uvicorn.Server):
     """Tells when it can be asked."""
 
-    def __init__(self, config: uvicorn.Config, ready: dict[str, Any], ready_file: Path | None, host: str) -> None:
+    def __init__(
+        self,
+        config: uvicorn.Config,
+        listener: socket.socket,
+        limits: Limits,
+        tls: ssl.SSLContext | None,
+        ready: dict[str, Any],
+        ready_file: Path | None,
+        host: str,
+    ) -> None:
         super().__init__(config)
+        self._acceptor = Acceptor(listener, limits, self._protocol, tls)
         self._everywhere = f" and all other addresses of {socket.gethostname()}" if host in ANY_ADDRESS else ""
         self._ready = ready
         self._ready_file = ready_file
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
+        self._acceptor.start()
         # What is there now stays; without this, each full collection looks through it, and all units wait 0.1 s.
         gc.freeze()
         text = json.dumps(self._ready)
@@ -75,24 +89,39 @@ class _Server(uvicorn.Server):
             lies_in = self._ready[f"{role.value}_token_file"]
             print(f"master-server: the token of the {role.value} lies in {lies_in}", flush=True)
 
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._acceptor.close()
+        await super().shutdown(sockets)
+
+    def _protocol(self) -> GuardedHttp:
+        return GuardedHttp(self.config, self.server_state, self.lifespan.state)
+
 
 def _serve(config: MasterConfig) -> None:
     cell = Cell.load(config.cell)
     access = load_access(config.state_dir, config.public_reads)
+    tls = None
+    if config.tls_certificate is not None and config.tls_key is not None:
+        tls = server_context(config.tls_certificate, config.tls_key)
+        print(f"master-server: the certificate's fingerprint is sha256 {fingerprint(config.tls_certificate)}")
+    limits = Limits()
     master = Master(cell, config.settings)
-    app = make_app(master, access, Recorder(master, config.recording, config.state_dir / "recordings"))
+    recorder = Recorder(master, config.recording, config.state_dir / "recordings")
+    app = make_app(master, access, recorder, limits)
     listener = _listen(config.host, config.port)
     port = listener.getsockname()[1]
     host = "127.0.0.1" if config.host in ANY_ADDRESS else config.host
     ready = {
-        "url": f"http://{f'[{host}]' if ':' in host else host}:{port}",
+        "url": f"{'http' if tls is None else 'https'}://{f'[{host}]' if ':' in host else host}:{port}",
         "port": port,
         "pid": os.getpid(),
         **{f"{role.value}_token_file": str(token_file(config.state_dir, role)) for role in Role},
     }
+    logging.getLogger("uvicorn.error").addFilter(quiet)
     server = _Server(
         uvicorn.Config(
             app,
+            http=GuardedHttp,
             log_config=None,
             access_log=False,
             # The caller's address is that of its connection, whatever a header says.
@@ -102,6 +131,9 @@ def _serve(config: MasterConfig) -> None:
             timeout_graceful_shutdown=STOP_S,
             **SERVER_OPTIONS,
         ),
+        listener,
+        limits,
+        tls,
         ready,
         config.ready_file,
         config.host,
@@ -109,7 +141,8 @@ def _serve(config: MasterConfig) -> None:
     # Once it has stopped in good order, the server raises the signal that it got again.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        server.run(sockets=[listener])
+        # It opens none itself: those of the listener are taken in within bounds.
+        server.run(sockets=[])
     finally:
         listener.close()
         if config.ready_file is not None:
@@ -129,7 +162,7 @@ def _listen(host: str, port: int) -> socket.socket:
 
 def _config(options: argparse.Namespace) -> MasterConfig:
     overrides: dict[str, Any] = dict(assignments(options.set))
-    for name in ("cell", "host", "port", "state_dir", "ready_file"):
+    for name in ("cell", "host", "port", "state_dir", "ready_file", "tls_certificate", "tls_key"):
         if (value := getattr(options, name)) is not None:
             overrides[name] = value
     if options.record is not None:
@@ -151,6 +184,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--host", help="address to listen at (default: all)")
     parser.add_argument("--port", type=int, help="port to listen at, 0 for a free one (default: 8420)")
     parser.add_argument("--state-dir", type=Path, metavar="DIR", help="where tokens are kept")
+    parser.add_argument("--tls-certificate", type=Path, metavar="PEM", help="speak TLS with this certificate ...")
+    parser.add_argument("--tls-key", type=Path, metavar="PEM", help="... and its key")
     parser.add_argument("--ready-file", type=Path, metavar="FILE", help="written as JSON when the master can be asked")
     parser.add_argument("--public-reads", action="store_true", help="reading needs no token")
     parser.add_argument("--record", type=Path, metavar="DIR", help="record what the master sees, as MCAP files")

@@ -14,15 +14,20 @@ from starlette.types import Receive, Scope, Send
 
 from master_server.access import Access
 from master_server.cell_loading import CellLoader
+from master_server.limits import Limits
 from master_server.master import Master
 from master_server.metrics import Metrics
 from master_server.recording import Recorder
 from master_server.routes import cell, health, map, recording, robot, stream, units
+from master_server.routes.common import ip_of, refused
 from master_server.routes.update import UpdateEndpoint
 from master_server.stream import Stream
 from shared.clock import monotonic_ns
 from shared.configuration import sentence_of
 from shared.errors import CellError, CellwatchError, InputError, Refusal, WireError
+
+TRY_AGAIN_LATER = 1013
+"""What a WebSocket is closed with when there were too many."""
 
 
 class Application(FastAPI):
@@ -31,17 +36,32 @@ class Application(FastAPI):
     update: UpdateEndpoint
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            await super().__call__(scope, receive, send)
+            return
+        # Before anything else, so that whom it refuses costs next to nothing.
+        try:
+            self.state.limits.admit(ip_of(scope), monotonic_ns())
+        except Refusal as refusal:
+            if scope["type"] == "http":
+                await refused(refusal)(scope, receive, send)
+            else:
+                await send({"type": "websocket.close", "code": TRY_AGAIN_LATER, "reason": str(refusal)})
+            return
         if scope["type"] == "http" and scope["path"] == "/update" and scope["method"] == "POST":
+            scope["app"] = self
             await self.update(scope, receive, send)
         else:
             await super().__call__(scope, receive, send)
 
 
-def make_app(master: Master, access: Access, recorder: Recorder | None = None) -> Application:
-    """The application that serves one master."""
+def make_app(
+    master: Master, access: Access, recorder: Recorder | None = None, limits: Limits | None = None
+) -> Application:
+    """The application that serves one master; `limits` are shared with what holds its connections."""
     listeners = Stream(master)
     metrics = Metrics(master, listeners)
-    update = UpdateEndpoint(master, access, metrics)
+    update = UpdateEndpoint(master, metrics)
 
     @asynccontextmanager
     async def running(app: FastAPI) -> AsyncIterator[None]:
@@ -71,6 +91,7 @@ def make_app(master: Master, access: Access, recorder: Recorder | None = None) -
     app.update = update
     app.state.master = master
     app.state.access = access
+    app.state.limits = limits or Limits()
     app.state.loader = CellLoader()
     app.state.stream = listeners
     app.state.recorder = recorder
@@ -83,7 +104,7 @@ def make_app(master: Master, access: Access, recorder: Recorder | None = None) -
 
 async def _refused(request: Request, error: Exception) -> Response:
     assert isinstance(error, CellwatchError)
-    return JSONResponse({"detail": str(error)}, error.status if isinstance(error, Refusal) else 422)
+    return refused(error)
 
 
 async def _invalid(request: Request, error: Exception) -> Response:

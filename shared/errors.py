@@ -78,9 +78,10 @@ class MasterRefused(UplinkError):
 class Refusal(CellwatchError):
     """The master says no to a request."""
 
-    def __init__(self, status: int, message: str) -> None:
+    def __init__(self, status: int, message: str, retry_after_s: int | None = None) -> None:
         super().__init__(message)
         self.status = status
+        self.retry_after_s = retry_after_s
 
 
 class JitCacheError(CellwatchError):

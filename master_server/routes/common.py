@@ -11,12 +11,15 @@ import msgpack
 from fastapi import Depends, Request, Response
 from fastapi.routing import APIRoute
 from fastapi.security import HTTPBearer
-from starlette.requests import ClientDisconnect
+from starlette.requests import ClientDisconnect, HTTPConnection
+from starlette.responses import JSONResponse
 from starlette.types import Message, Scope
 
 from master_server.access import ANYONE, OPERATORS, UNITS, Access, Role
+from master_server.limits import Limits, plain_ip
 from master_server.master import Master
-from shared.errors import Refusal, WireError
+from shared.clock import monotonic_ns
+from shared.errors import CellwatchError, Refusal, WireError
 from shared.waiting import at_once_or_within, within
 from shared.wire import MEDIA_TYPE, unpack
 
@@ -26,8 +29,8 @@ MAX_BODY_BYTES = 2**18
 BODY_TIMEOUT_S = 5.0
 """A unit sends a body in one go; who takes longer holds a connection for nothing."""
 
-PREFIX = "::ffff:"
-"""IPv4 addresses look like this on a socket for both."""
+CLOSING = frozenset({401, 408, 413, 429})
+"""Refused before the body was read, and nobody will read it."""
 
 
 async def body_of(request: Request, max_bytes: int) -> bytes:
@@ -43,6 +46,7 @@ async def body_of(request: Request, max_bytes: int) -> bytes:
             raise Refusal(408, f"body: expected all of it within {BODY_TIMEOUT_S:g} s, got {len(body)} bytes")
     except ClientDisconnect as error:
         raise Refusal(400, "body: the sender went away") from error
+    limits_of(request).read(ip_of(request.scope), len(body), monotonic_ns())
     return bytes(body)
 
 
@@ -77,7 +81,16 @@ def ip_of(scope: Scope) -> str:
     client = scope.get("client")
     if client is None:
         raise Refusal(400, "the connection has no address")
-    return str(client[0]).removeprefix(PREFIX)
+    return plain_ip(str(client[0]))
+
+
+def refused(error: CellwatchError) -> Response:
+    """A refusal as every route answers it: one sentence."""
+    status = error.status if isinstance(error, Refusal) else 422
+    headers = {"Connection": "close"} if status in CLOSING else {}
+    if isinstance(error, Refusal) and error.retry_after_s is not None:
+        headers["Retry-After"] = str(error.retry_after_s)
+    return JSONResponse({"detail": str(error)}, status, headers)
 
 
 class Negotiated(APIRoute):
@@ -114,36 +127,65 @@ async def master_of(request: Request) -> Master:
     return master
 
 
-def access_of(request: Request) -> Access:
+def access_of(request: HTTPConnection) -> Access:
     """The tokens of this application."""
     access = request.app.state.access
     assert isinstance(access, Access)
     return access
 
 
-def authorization_of(request: Request) -> bytes | None:
+def limits_of(request: HTTPConnection) -> Limits:
+    """What each address may ask for."""
+    limits = request.app.state.limits
+    assert isinstance(limits, Limits)
+    return limits
+
+
+def role_of(request: HTTPConnection, allowed: frozenset[Role], authorization: bytes | None = None) -> Role:
+    """Whose token came with this request, in its header or as `authorization` in the same form.
+
+    Raises:
+        Refusal: 401 without a valid one, 403 with one of another role, 429 after too many wrong ones.
+    """
+    authorization = authorization or authorization_of(request)
+    access = access_of(request)
+    if authorization is None:
+        return access.check(None, allowed)
+    limits, ip, now_ns = limits_of(request), ip_of(request.scope), monotonic_ns()
+    limits.may_show_token(ip, now_ns)
+    try:
+        role = access.check(authorization, ANYONE)
+    except Refusal:
+        limits.token_was_wrong(ip, now_ns)
+        raise
+    limits.token_was_right(ip, now_ns)
+    return role if role in allowed else access.check(authorization, allowed)
+
+
+def authorization_of(request: HTTPConnection) -> bytes | None:
     """The `Authorization` header as it came."""
     return next((value for name, value in request.scope["headers"] if name == b"authorization"), None)
 
 
 async def may_read(request: Request) -> None:
     """Dependency: any token, or none where reads are public."""
-    access_of(request).check_read(authorization_of(request))
+    if not access_of(request).public_reads:
+        role_of(request, ANYONE)
 
 
 async def is_operator(request: Request) -> None:
     """Dependency: the operator's token."""
-    access_of(request).check(authorization_of(request), OPERATORS)
+    role_of(request, OPERATORS)
 
 
 async def is_unit(request: Request) -> None:
     """Dependency: the units' token."""
-    access_of(request).check(authorization_of(request), UNITS)
+    role_of(request, UNITS)
 
 
 async def is_known(request: Request) -> Role:
     """Dependency: either token; tells whose it is."""
-    return access_of(request).check(authorization_of(request), UNITS | OPERATORS)
+    return role_of(request, ANYONE)
 
 
 # Only so that the documentation of the API tells of it; the checks are above.
@@ -173,7 +215,7 @@ async def _as_json(request: Request) -> Request:
     if request.method in ("GET", "DELETE", "HEAD"):
         return request
     # Before anything is read, so that a stranger costs nothing; whose token it must be, each route checks.
-    access_of(request).check(authorization_of(request), ANYONE)
+    role_of(request, ANYONE)
     body = await body_of(request, MAX_BODY_BYTES)
     headers = request.scope["headers"]
     if request.headers.get("content-type", "").split(";")[0].strip() == MEDIA_TYPE:

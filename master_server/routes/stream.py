@@ -13,11 +13,10 @@ from typing import Literal
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 from pydantic import BaseModel, ConfigDict, ValidationError
-from starlette.responses import JSONResponse
 
-from master_server.access import Access
+from master_server.access import ANYONE
 from master_server.answers import Form
-from master_server.routes.common import ip_of
+from master_server.routes.common import access_of, ip_of, refused, role_of
 from master_server.stream import Listener, Stream, Wish
 from shared.configuration import sentence
 from shared.errors import Refusal
@@ -45,14 +44,14 @@ class StreamQuery(BaseModel):
 @router.websocket("/stream")
 async def stream(websocket: WebSocket) -> None:
     """The newest map at each change, as `StreamMessage`; who is slow skips."""
-    access, source = websocket.app.state.access, websocket.app.state.stream
-    assert isinstance(access, Access)
+    source = websocket.app.state.stream
     assert isinstance(source, Stream)
     try:
-        access.check_read(_authorization(websocket))
+        if not access_of(websocket).public_reads:
+            role_of(websocket, ANYONE, _authorization(websocket))
         listener = source.listen(_wish(websocket))
     except Refusal as refusal:
-        await websocket.send_denial_response(JSONResponse({"detail": str(refusal)}, refusal.status))
+        await websocket.send_denial_response(refused(refusal))
         return
     fields = {"event": "stream", "ip": ip_of(websocket.scope)}
     with listener:

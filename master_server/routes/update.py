@@ -7,13 +7,12 @@ Fifty units at 30 frames a second take it 1,500 times a second.
 from __future__ import annotations
 
 from starlette.requests import Request
-from starlette.responses import JSONResponse
 from starlette.types import Receive, Scope, Send
 
-from master_server.access import UNITS, Access
+from master_server.access import UNITS
 from master_server.master import Master
 from master_server.metrics import Metrics
-from master_server.routes.common import authorization_of, body_of, ip_of
+from master_server.routes.common import body_of, ip_of, refused, role_of
 from shared.clock import monotonic_ns
 from shared.errors import Refusal, WireError
 from shared.wire import MAX_UPDATE_BYTES, MEDIA_TYPE, decode_update, encode_update_answer
@@ -24,9 +23,8 @@ CONTENT_TYPE = (b"content-type", MEDIA_TYPE.encode())
 class UpdateEndpoint:
     """An ASGI application for the one path."""
 
-    def __init__(self, master: Master, access: Access, metrics: Metrics) -> None:
+    def __init__(self, master: Master, metrics: Metrics) -> None:
         self._master = master
-        self._access = access
         self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -34,16 +32,15 @@ class UpdateEndpoint:
         try:
             body = await self._answer(request)
         except (Refusal, WireError) as error:
-            status = error.status if isinstance(error, Refusal) else 422
-            self._metrics.refused(status)
-            await JSONResponse({"detail": str(error)}, status)(scope, receive, send)
+            self._metrics.refused(error.status if isinstance(error, Refusal) else 422)
+            await refused(error)(scope, receive, send)
         else:
             length = (b"content-length", str(len(body)).encode())
             await send({"type": "http.response.start", "status": 200, "headers": [CONTENT_TYPE, length]})
             await send({"type": "http.response.body", "body": body})
 
     async def _answer(self, request: Request) -> bytes:
-        self._access.check(authorization_of(request), UNITS)
+        role_of(request, UNITS)
         body = await body_of(request, MAX_UPDATE_BYTES)
         received_at_ns = monotonic_ns()
         update = decode_update(body)

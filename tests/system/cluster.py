@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import signal
+import ssl
 import subprocess
 import sys
 import time
@@ -71,6 +72,7 @@ class Cluster:
     port: int = 0
     url: str = "http://127.0.0.1:9"
     unit_token_file: str = ""
+    verify: ssl.SSLContext | bool = True
     operator: httpx.Client = field(default_factory=lambda: httpx.Client(trust_env=False))
 
     def __enter__(self) -> Cluster:
@@ -120,6 +122,7 @@ class Cluster:
             base_url=self.url,
             headers={"Authorization": f"Bearer {Path(found['operator_token_file']).read_text().strip()}"},
             trust_env=False,
+            verify=self.verify,
         )
         return process
 

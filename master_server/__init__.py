@@ -13,6 +13,7 @@ In the order of the flow:
     merge        the units' voxels, merged (Algorithm 9)
     registry     the units' slots and how far each can be trusted (Algorithm 8)
     master       all of that held together, without a network
+    readable     what those ask of who only read: a master, or a recording of one
     answers      what readers are told of it
     stream       the map as it changes, for many listeners
     metrics      what a monitoring system reads
@@ -20,6 +21,8 @@ In the order of the flow:
     foxglove     such a moment in the schemas that Foxglove shows
     recording_file    one file of a recording
     recording    files one after another, in a thread that nothing waits for
+    recorded     a recording opened for reading
+    replay       a recording that answers as the master did
     config       the master's own configuration
     routes/      the same as HTTP
     app          the web application, assembled

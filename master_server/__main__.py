@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`master-server --cell CELL.YAML`: serve one cell until told to stop."""
+"""`master-server --cell CELL.YAML`: serve one cell until told to stop.
+
+`master-server replay FILE` serves a recording in its place, `master-server recording-info FILE` tells what is in one.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +15,21 @@ import signal
 import socket
 import ssl
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import uvicorn
 
-from master_server.access import Role, load_access, token_file
-from master_server.app import make_app
-from master_server.config import ENVIRONMENT_PREFIX, MasterConfig
+from master_server.access import Access, Role, load_access, token_file
+from master_server.app import Application, make_app, make_replay_app
+from master_server.config import ENVIRONMENT_PREFIX, MasterConfig, ReplayConfig, ServerConfig
 from master_server.connections import Acceptor, GuardedHttp, fingerprint, quiet, server_context
 from master_server.limits import Limits
 from master_server.master import Master
+from master_server.recorded import Progress, Recording, summary
 from master_server.recording import Recorder
+from master_server.replay import Replay
 from master_server.websocket import SERVER_OPTIONS
 from shared.cell import Cell
 from shared.configuration import assignments, load
@@ -38,15 +43,24 @@ STOP_S = 1
 BACKLOG = 256
 """Units that connect in the same moment, as after a power cut, with room to spare."""
 
+LISTENING = ("host", "port", "state_dir", "ready_file", "public_reads", "tls_certificate", "tls_key")
+REPLAY_OPTIONS = ("file", "speed", "start_s", "loop", *LISTENING)
+
+SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+
 ANY_ADDRESS = ("0.0.0.0", "::")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; what can be expected to go wrong is one line and exit code 1."""
-    options = _parser().parse_args(arguments)
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given and given[0] in PARSERS:
+        options = PARSERS[given[0]]().parse_args(given[1:])
+    else:
+        options = _parser().parse_args(given)
     logging.basicConfig(level=options.log_level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     try:
-        _serve(_config(options))
+        options.run(options)
     except CellwatchError as error:
         print(f"master-server: {error}", file=sys.stderr)
         return 1
@@ -97,17 +111,48 @@ class _Server(uvicorn.Server):
         return GuardedHttp(self.config, self.server_state, self.lifespan.state)
 
 
-def _serve(config: MasterConfig) -> None:
-    cell = Cell.load(config.cell)
+def _serve_master(options: argparse.Namespace) -> None:
+    config = _config(options)
+    master = Master(Cell.load(config.cell), config.settings)
+    recorder = Recorder(master, config.recording, config.state_dir / "recordings")
+    _serve(config, lambda access, limits: make_app(master, access, recorder, limits))
+
+
+def _serve_replay(options: argparse.Namespace) -> None:
+    config = load(ReplayConfig, None, os.environ, ENVIRONMENT_PREFIX, _overrides(options, REPLAY_OPTIONS))
+    with Recording(config.file, _progress(config.file)) as recording:
+        if recording.trouble:
+            logger.warning("%s: %s", config.file, recording.trouble)
+        replay = Replay(recording, config.speed, config.start_s, config.loop)
+        _serve(config, lambda access, limits: make_replay_app(replay, access, limits))
+
+
+def _tell_recording(options: argparse.Namespace) -> None:
+    with Recording(options.file, _progress(options.file)) as recording:
+        print("\n".join(summary(recording)))
+
+
+def _progress(file: Path) -> Progress | None:
+    """Tell a person how far the reading of a file is."""
+    if not sys.stderr.isatty():
+        return None
+
+    def tell(read: int, total: int) -> None:
+        print(f"\rmaster-server: reading {file.name}: {read / total:.0%}", end="", file=sys.stderr, flush=True)
+        if read >= total:
+            print(file=sys.stderr)
+
+    return tell
+
+
+def _serve(config: ServerConfig, make: Callable[[Access, Limits], Application]) -> None:
     access = load_access(config.state_dir, config.public_reads)
     tls = None
     if config.tls_certificate is not None and config.tls_key is not None:
         tls = server_context(config.tls_certificate, config.tls_key)
         print(f"master-server: the certificate's fingerprint is sha256 {fingerprint(config.tls_certificate)}")
     limits = Limits()
-    master = Master(cell, config.settings)
-    recorder = Recorder(master, config.recording, config.state_dir / "recordings")
-    app = make_app(master, access, recorder, limits)
+    app = make(access, limits)
     listener = _listen(config.host, config.port)
     port = listener.getsockname()[1]
     host = "127.0.0.1" if config.host in ANY_ADDRESS else config.host
@@ -161,15 +206,15 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _config(options: argparse.Namespace) -> MasterConfig:
-    overrides: dict[str, Any] = dict(assignments(options.set))
-    for name in ("cell", "host", "port", "state_dir", "ready_file", "tls_certificate", "tls_key"):
-        if (value := getattr(options, name)) is not None:
-            overrides[name] = value
+    overrides = _overrides(options, ("cell", *LISTENING))
     if options.record is not None:
         overrides |= {"recording.enabled": True, "recording.folder": str(options.record)}
-    if options.public_reads:
-        overrides["public_reads"] = True
     return load(MasterConfig, options.config, os.environ, ENVIRONMENT_PREFIX, overrides)
+
+
+def _overrides(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
+    overrides: dict[str, Any] = dict(assignments(options.set))
+    return overrides | {name: value for name in names if (value := getattr(options, name)) is not None}
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -177,23 +222,66 @@ def _parser() -> argparse.ArgumentParser:
         prog="master-server",
         description="The master that all edge units post to.",
         epilog=f"Every option may also be a variable, as in {ENVIRONMENT_PREFIX}PORT=9000; flags win over variables, "
-        "and those over the file.",
+        "and those over the file. See also `master-server replay --help` and `master-server recording-info --help`.",
     )
+    parser.set_defaults(run=_serve_master)
     parser.add_argument("--config", type=Path, metavar="YAML", help="configuration file")
     parser.add_argument("--cell", type=Path, metavar="YAML", help="the cell that is watched (cell.yaml)")
+    _add_server_options(parser)
+    parser.add_argument("--record", type=Path, metavar="DIR", help="record what the master sees, as MCAP files")
+    return parser
+
+
+def _replay_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="master-server replay",
+        description="Serve a recording as if it were the master; pause and move in it.",
+    )
+    parser.set_defaults(run=_serve_replay)
+    parser.add_argument("file", type=Path, help="a recording (.mcap)")
+    parser.add_argument("--speed", type=float, help="1 is as it was")
+    parser.add_argument("--from", dest="start_s", type=_seconds, metavar="TIME", help="begin there, as in 30s or 5m")
+    parser.add_argument("--loop", action="store_true", default=None, help="begin anew at the end")
+    _add_server_options(parser)
+    return parser
+
+
+def _info_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="master-server recording-info", description="Tell what is in a recording.")
+    parser.set_defaults(run=_tell_recording)
+    parser.add_argument("file", type=Path, help="a recording (.mcap)")
+    _add_log_level(parser)
+    return parser
+
+
+def _add_server_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", help="address to listen at (default: all)")
     parser.add_argument("--port", type=int, help="port to listen at, 0 for a free one (default: 8420)")
     parser.add_argument("--state-dir", type=Path, metavar="DIR", help="where tokens are kept")
     parser.add_argument("--tls-certificate", type=Path, metavar="PEM", help="speak TLS with this certificate ...")
     parser.add_argument("--tls-key", type=Path, metavar="PEM", help="... and its key")
     parser.add_argument("--ready-file", type=Path, metavar="FILE", help="written as JSON when the master can be asked")
-    parser.add_argument("--public-reads", action="store_true", help="reading needs no token")
-    parser.add_argument("--record", type=Path, metavar="DIR", help="record what the master sees, as MCAP files")
+    parser.add_argument("--public-reads", action="store_true", default=None, help="reading needs no token")
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="any other, as in settings.voxel_size_m=0.03"
     )
+    _add_log_level(parser)
+
+
+def _add_log_level(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--log-level", default="INFO", choices=("DEBUG", "INFO", "WARNING", "ERROR"))
-    return parser
+
+
+def _seconds(text: str) -> float:
+    """`90`, `90s`, `1.5m` or `1h`."""
+    number, unit = (text[:-1], text[-1]) if text[-1:] in SECONDS else (text, "s")
+    try:
+        return float(number) * SECONDS[unit]
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"expected a time as in 30s, 5m or 1h, got {text}") from error
+
+
+PARSERS = {"replay": _replay_parser, "recording-info": _info_parser}
 
 
 if __name__ == "__main__":

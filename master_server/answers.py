@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
-from master_server.master import MapView, Master
+from master_server.master import MapView
+from master_server.readable import Readable
 from shared.lattice import Lattice
 from shared.messages import LatticeDescription, State, VoxelsAnswer
 
@@ -84,34 +85,15 @@ def unseen_fields(blocks: Lattice, seen_by: NDArray[np.uint8]) -> dict[str, Any]
     return {**LatticeDescription.of(blocks).model_dump(), "blocks": np.argwhere(seen_by == 0).tolist()}
 
 
-def unit_states(master: Master, now_ns: int) -> list[dict[str, Any]]:
-    """The fields of a `UnitState` for each unit."""
-    rows = []
-    for slot in master.registry:
-        state, reason = master.judge(slot, now_ns)
-        age_s = slot.age_s(now_ns)
-        rows.append(
-            {
-                "id": slot.id,
-                "ip": slot.ip,
-                "state": state,
-                "reason": reason,
-                "age_s": None if age_s is None else round(age_s, 4),
-                "voxels": len(slot.keys),
-            }
-        )
-    return rows
-
-
 def coverage_shares(seen_by: NDArray[np.uint8]) -> list[float]:
     """Shares of the blocks seen by 0, 1, ... and `MANY` or more units; they sum to 1."""
     counts = np.bincount(np.minimum(seen_by, MANY).ravel(), minlength=MANY + 1)
     return [float(count) / seen_by.size for count in counts]
 
 
-def coverage_fields(master: Master, with_blocks: bool, now_ns: int) -> dict[str, Any]:
+def coverage_fields(master: Readable, with_blocks: bool, now_ns: int) -> dict[str, Any]:
     """The fields of `CoverageAnswer`."""
-    view, seen_by, blocks = master.view(now_ns), master.seen_by(now_ns), master.coverage.blocks
+    view, seen_by, blocks = master.view(now_ns), master.seen_by(now_ns), master.blocks_at(now_ns)
     shares = coverage_shares(seen_by)
     return {
         "shares": [round(share, 6) for share in shares],

@@ -6,20 +6,23 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from fastapi import FastAPI, Request, Response
+from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.routing import Route
-from starlette.types import Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from master_server.access import Access
 from master_server.cell_loading import CellLoader
 from master_server.limits import Limits
 from master_server.master import Master
 from master_server.metrics import Metrics
+from master_server.readable import Readable
 from master_server.recording import Recorder
-from master_server.routes import cell, health, map, recording, robot, stream, units
+from master_server.replay import Replay
+from master_server.routes import cell, health, map, recording, replay, robot, stream, units
 from master_server.routes.common import ip_of, refused
+from master_server.routes.replay import RefusedUpdate
 from master_server.routes.update import UpdateEndpoint
 from master_server.stream import Stream
 from shared.clock import monotonic_ns
@@ -29,11 +32,19 @@ from shared.errors import CellError, CellwatchError, InputError, Refusal, WireEr
 TRY_AGAIN_LATER = 1013
 """What a WebSocket is closed with when there were too many."""
 
+REPLAY_HEADER = (b"cellwatch-replay", b"true")
+"""With every answer of a replay, so that nobody takes it for now."""
+
 
 class Application(FastAPI):
     """FastAPI, but for the one path that takes an update: it is spared the way through it."""
 
-    update: UpdateEndpoint
+    update: ASGIApp
+
+    def take_updates(self, update: ASGIApp) -> None:
+        """From now on `update` answers `POST /update`."""
+        self.update = update
+        self.router.routes.append(Route("/update", update, methods=["POST"]))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
@@ -55,13 +66,48 @@ class Application(FastAPI):
             await super().__call__(scope, receive, send)
 
 
+class ReplayApplication(Application):
+    """The same, each answer marked as that of a replay."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def marked(message: Message) -> None:
+            if message["type"] in ("http.response.start", "websocket.accept", "websocket.http.response.start"):
+                message = {**message, "headers": [*message.get("headers", ()), REPLAY_HEADER]}
+            await send(message)
+
+        await super().__call__(scope, receive, marked)
+
+
 def make_app(
     master: Master, access: Access, recorder: Recorder | None = None, limits: Limits | None = None
 ) -> Application:
     """The application that serves one master; `limits` are shared with what holds its connections."""
+    routers = [module.router for module in (units, cell, map, stream, robot, recording, health)]
+    app = _assembled(Application, master, access, routers, recorder, limits)
+    app.state.loader = CellLoader()
+    app.state.metrics = metrics = Metrics(master, app.state.stream)
+    app.state.started_at_ns = monotonic_ns()
+    app.take_updates(UpdateEndpoint(master, metrics))
+    return app
+
+
+def make_replay_app(played: Replay, access: Access, limits: Limits | None = None) -> Application:
+    """The application that serves a recording as if it were the master."""
+    routers = [module.router for module in (units, cell, map, stream, robot, recording, replay)]
+    app = _assembled(ReplayApplication, played, access, routers, None, limits)
+    app.take_updates(RefusedUpdate())
+    return app
+
+
+def _assembled(
+    kind: type[Application],
+    master: Readable,
+    access: Access,
+    routers: list[APIRouter],
+    recorder: Recorder | None,
+    limits: Limits | None,
+) -> Application:
     listeners = Stream(master)
-    metrics = Metrics(master, listeners)
-    update = UpdateEndpoint(master, metrics)
 
     @asynccontextmanager
     async def running(app: FastAPI) -> AsyncIterator[None]:
@@ -75,7 +121,7 @@ def make_app(
             if recorder is not None:
                 await recorder.stop()
 
-    app = Application(
+    app = kind(
         title="Cellwatch master",
         description=(master.__doc__ or "").splitlines()[0],
         exception_handlers={
@@ -85,20 +131,15 @@ def make_app(
             CellError: _refused,
             RequestValidationError: _invalid,
         },
-        routes=[Route("/update", update, methods=["POST"])],
         lifespan=running,
     )
-    app.update = update
     app.state.master = master
     app.state.access = access
     app.state.limits = limits or Limits()
-    app.state.loader = CellLoader()
     app.state.stream = listeners
     app.state.recorder = recorder
-    app.state.metrics = metrics
-    app.state.started_at_ns = monotonic_ns()
-    for module in (units, cell, map, stream, robot, recording, health):
-        app.include_router(module.router)
+    for router in routers:
+        app.include_router(router)
     return app
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from master_server.recording import RecordingConfig
+from master_server.replay import SPEED_MAX, SPEED_MIN
 from shared.settings import Settings
 
 ENVIRONMENT_PREFIX = "CELLWATCH_MASTER_"
@@ -24,26 +25,40 @@ def default_state_dir() -> Path:
     return Path(home) / "cellwatch" / "master"
 
 
-class MasterConfig(BaseModel):
-    """Frozen; from a YAML file, `CELLWATCH_MASTER_*` variables and flags. Only `cell` has no default."""
+class ServerConfig(BaseModel):
+    """Where to listen, and whom to let in. Frozen; from a YAML file, `CELLWATCH_MASTER_*` variables and flags."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    cell: Path = Field(description="The cell's `cell.yaml`.")
     host: str = Field(default="0.0.0.0", description="Address to listen at.")
     port: int = Field(default=DEFAULT_PORT, ge=0, le=65535, description="0 takes a free one.")
     tls_certificate: Path | None = Field(default=None, description="PEM; with it and its key the master speaks TLS.")
     tls_key: Path | None = Field(default=None, description="Of the certificate, in PEM, without a password.")
     state_dir: Path = Field(default_factory=default_state_dir, description="Where tokens are kept.")
     public_reads: bool = Field(default=False, description="Whether reading needs no token.")
-    settings: Settings = Field(default=Settings(), description="What the master starts with.")
-    recording: RecordingConfig = Field(default=RecordingConfig(), description="What is recorded, and how much is kept.")
     ready_file: Path | None = Field(
         default=None, description="Written as JSON (url, port, pid, token files) when the master can be asked."
     )
 
     @model_validator(mode="after")
-    def _certificate_with_its_key(self) -> MasterConfig:
+    def _certificate_with_its_key(self) -> ServerConfig:
         if (self.tls_certificate is None) != (self.tls_key is None):
             raise ValueError("expected tls_certificate and tls_key, got one of them")
         return self
+
+
+class MasterConfig(ServerConfig):
+    """Of a master. Only `cell` has no default."""
+
+    cell: Path = Field(description="The cell's `cell.yaml`.")
+    settings: Settings = Field(default=Settings(), description="What the master starts with.")
+    recording: RecordingConfig = Field(default=RecordingConfig(), description="What is recorded, and how much is kept.")
+
+
+class ReplayConfig(ServerConfig):
+    """Of a recording that is served in place of a master."""
+
+    file: Path = Field(description="The recording.")
+    speed: float = Field(default=1.0, ge=SPEED_MIN, le=SPEED_MAX, description="Of the replay, 1 as it was.")
+    start_s: float = Field(default=0.0, ge=0.0, description="Where in the recording it begins.")
+    loop: bool = Field(default=False, description="Whether it begins anew at its end.")

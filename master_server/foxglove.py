@@ -27,7 +27,7 @@ from trimesh.transformations import quaternion_from_matrix
 
 from master_server.master import MapView
 from master_server.recording_format import Moment
-from shared.cell import Cell
+from shared.cell import Cell, PlacedMesh
 from shared.lattice import Lattice
 from shared.meshes import TriangleMesh
 from shared.transforms import Transform
@@ -79,12 +79,13 @@ def point_cloud(view: MapView, stamp: Timestamp) -> PointCloud:
 
 
 def transforms(moment: Moment, stamp: Timestamp) -> FrameTransforms:
-    """Where the cameras are (`unit_3`) and the robot's links (`robot/forearm`), as far as it is known."""
+    """Where cameras (`unit_3`), objects (`object/pallet`) and links (`robot/forearm`) are, as far as it is known."""
     found = [
         _transform(f"unit_{row.id}", np.array(row.T_world_camera), stamp)
         for row in moment.units
         if row.T_world_camera is not None
     ]
+    found += [_transform(_object_frame(body), body.T_world_mesh, stamp) for body in moment.cell.objects]
     robot = moment.cell.robot
     if robot is not None and moment.robot.joints:
         poses = robot.link_poses(moment.robot.joints[-1].positions)
@@ -93,11 +94,17 @@ def transforms(moment: Moment, stamp: Timestamp) -> FrameTransforms:
 
 
 def cell_scene(cell: Cell, stamp: Timestamp) -> SceneUpdate:
-    """The cell's box as lines, its CAD and the robot's links as models; replaces whatever cell there was."""
+    """The cell's box as lines, its CAD and the robot's links as models; replaces whatever cell there was.
+
+    Where objects and links are, `transforms` tells, so that a pallet on its way is not drawn again and again.
+    """
     entities = [SceneEntity(timestamp=stamp, frame_id=WORLD, id="box", lines=[_box_lines(cell)])]
     entities += [
-        _model(f"cad/{body.name}", WORLD, body.mesh, body.T_world_mesh, CAD_COLOR, stamp)
-        for body in (*cell.static, *cell.objects)
+        _model(f"cad/{body.name}", WORLD, body.mesh, body.T_world_mesh, CAD_COLOR, stamp) for body in cell.static
+    ]
+    entities += [
+        _model(_object_frame(body), _object_frame(body), body.mesh, np.eye(4), CAD_COLOR, stamp)
+        for body in cell.objects
     ]
     if cell.robot is not None:
         entities += [
@@ -172,6 +179,10 @@ def _joined(
 
 def _link_frame(name: str) -> str:
     return f"robot/{name}"
+
+
+def _object_frame(body: PlacedMesh) -> str:
+    return f"object/{body.name}"
 
 
 def _transform(child: str, T_world_child: Transform, stamp: Timestamp) -> FrameTransform:

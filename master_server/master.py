@@ -149,6 +149,24 @@ class Master:
         """One row a unit."""
         return [slot.row(now_ns, *self.judge(slot, now_ns)) for slot in self.registry]
 
+    def unit_states(self, now_ns: int) -> list[dict[str, Any]]:
+        """Of each row what a stream tells at every change: id, ip, state, reason, age and voxels."""
+        rows = []
+        for slot in self.registry:
+            state, reason = self.judge(slot, now_ns)
+            age_s = slot.age_s(now_ns)
+            rows.append(
+                {
+                    "id": slot.id,
+                    "ip": slot.ip,
+                    "state": state,
+                    "reason": reason,
+                    "age_s": None if age_s is None else round(age_s, 4),
+                    "voxels": len(slot.keys),
+                }
+            )
+        return rows
+
     def forget(self, unit_id: int) -> None:
         """Delete a unit. If it still runs it comes back, as a new one.
 
@@ -216,6 +234,10 @@ class Master:
     def seen_by(self, now_ns: int) -> NDArray[np.uint8]:
         """How many live units look through each block, in the shape of `coverage.blocks`."""
         return self.coverage.seen_by(slot.id for slot in self.registry if self.judge(slot, now_ns)[0] == "live")
+
+    def blocks_at(self, now_ns: int) -> Lattice:
+        """The blocks that `seen_by` counts in."""
+        return self.coverage.blocks
 
     def next_change_ns(self, now_ns: int) -> int | None:
         """The time after which a unit or the robot is stale if it stays silent; the first of them, None without any."""

@@ -34,6 +34,7 @@ from master_server.recording_format import (
     cell_attachment,
     mesh_attachment,
 )
+from shared.cell import Cell
 from shared.clock import NS_PER_S
 from shared.settings import Settings
 
@@ -142,6 +143,7 @@ class RecordingFile:
         stamp = foxglove.stamp_of(log_ns)
         if before is None or moment.reference != before.reference:
             self._attach(moment, log_ns)
+        if before is None or _drawn_parts(moment.cell) != _drawn_parts(before.cell):
             self._picture(CELL_TOPIC, foxglove.cell_scene(moment.cell, stamp), log_ns)
         if before is None or not _same_map(moment, before):
             self._picture(VOXELS_TOPIC, foxglove.point_cloud(moment.view, stamp), log_ns)
@@ -161,13 +163,15 @@ class RecordingFile:
 
     def _attach(self, moment: Moment, log_ns: int) -> None:
         """The cell and its meshes, each once a file."""
-        document, attachments = moment.cell.to_document()
-        named = {mesh_attachment(sha256): data for sha256, data in attachments.items()}
-        named[cell_attachment(moment.reference.sha256)] = json.dumps(document).encode()
-        for name, data in named.items():
-            if name not in self._attached:
-                self._writer.add_attachment(log_ns, log_ns, name, "application/octet-stream", data)
-                self._attached.add(name)
+        for sha256, mesh in moment.cell.meshes.items():
+            if sha256 not in self._attached:
+                name = mesh_attachment(sha256)
+                self._writer.add_attachment(log_ns, log_ns, name, "application/octet-stream", mesh.to_bytes())
+        sha256 = moment.reference.sha256
+        if sha256 not in self._attached:
+            document = json.dumps(moment.cell.document()).encode()
+            self._writer.add_attachment(log_ns, log_ns, cell_attachment(sha256), "application/json", document)
+        self._attached |= {sha256, *moment.cell.meshes}
 
     def _json_channel(self, topic: str, model: type[BaseModel]) -> int:
         schema = json.dumps(model.model_json_schema(mode="serialization")).encode()
@@ -198,3 +202,9 @@ def _same_map(a: Moment, b: Moment) -> bool:
 
 def _same_seen(a: Moment, b: Moment) -> bool:
     return a.blocks == b.blocks and np.array_equal(a.seen_by, b.seen_by)
+
+
+def _drawn_parts(cell: Cell) -> tuple[object, ...]:
+    """What a cell looks like but for where its objects are; its parts are the same in a cell whose objects moved."""
+    box = (*cell.box_min_m.tolist(), *cell.box_max_m.tolist())
+    return (box, cell.static, cell.robot, [(body.name, body.mesh.sha256) for body in cell.objects])

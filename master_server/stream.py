@@ -12,8 +12,9 @@ import asyncio
 import logging
 from typing import Any, Literal, NamedTuple
 
-from master_server.answers import Form, as_json, as_msgpack, map_fields, unit_states, unseen_fields
-from master_server.master import MapView, Master
+from master_server.answers import Form, as_json, as_msgpack, map_fields, unseen_fields
+from master_server.master import MapView
+from master_server.readable import Readable
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns, stage_ns
 from shared.errors import Refusal
 
@@ -112,7 +113,7 @@ class Listener:
 class Stream:
     """All listeners of one master, and the timer that looks when nobody reports."""
 
-    def __init__(self, master: Master) -> None:
+    def __init__(self, master: Readable) -> None:
         self.picture: Picture | None = None
         self._master = master
         self.listeners: set[Listener] = set()
@@ -179,14 +180,14 @@ class Stream:
         at_ns = now_ns + HEARTBEAT_NS
         self._look_at(at_ns if due_ns is None else min(at_ns, due_ns + DUE_SLACK_NS), now_ns)
         # Nobody needs it while nobody listens, but that states are judged, and so logged, at their time.
-        units = unit_states(self._master, now_ns)
+        units = self._master.unit_states(now_ns)
         if not self.listeners:
             self.picture = None
             return
         began_ns = stage_ns()
         unseen = None
         if any(listener.wish.unseen for listener in self.listeners):
-            unseen = unseen_fields(self._master.coverage.blocks, self._master.seen_by(now_ns))
+            unseen = unseen_fields(self._master.blocks_at(now_ns), self._master.seen_by(now_ns))
         self._number += 1
         self.picture = Picture(self._number, now_ns, self._master.view(now_ns), units, unseen)
         self.picture.cost_ns = stage_ns() - began_ns

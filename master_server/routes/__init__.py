@@ -11,5 +11,6 @@ In the order of the flow:
     stream    the merged map as it changes
     robot     the robot's joints
     recording  recording what the master sees
+    replay    a recording played, in place of a master
     health    whether the master lives, and how it fares
 """

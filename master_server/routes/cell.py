@@ -17,6 +17,7 @@ from master_server.routes.common import (
     READERS,
     MasterDependency,
     Negotiated,
+    ReadableDependency,
     body_of,
     pour,
 )
@@ -40,10 +41,11 @@ WRITTEN_AT_ONCE = 2**20
 
 
 @router.get("/cell", dependencies=READERS)
-async def cell(master: MasterDependency, response: Response) -> dict[str, Any]:
+async def cell(master: ReadableDependency, response: Response) -> dict[str, Any]:
     """The cell as a document that names its meshes by sha256; the ETag is the sha256 of the document."""
-    response.headers["ETag"] = f'"{master.published.reference.sha256}"'
-    return master.published.document
+    published = master.published
+    response.headers["ETag"] = f'"{published.reference.sha256}"'
+    return published.document
 
 
 @uploads.put(
@@ -85,7 +87,7 @@ async def move_object(name: ObjectName, body: ObjectPoseRequest, master: MasterD
 
 
 @router.get("/cell/meshes/{sha256}", dependencies=READERS, response_class=Response)
-async def mesh(sha256: Sha256, master: MasterDependency) -> Response:
+async def mesh(sha256: Sha256, master: ReadableDependency) -> Response:
     """A mesh in its canonical bytes; it never changes, so keep it for ever."""
     data = master.published.meshes.get(sha256)
     if data is None:

@@ -18,6 +18,8 @@ from starlette.types import Message, Scope
 from master_server.access import ANYONE, OPERATORS, UNITS, Access, Role
 from master_server.limits import Limits, plain_ip
 from master_server.master import Master
+from master_server.readable import Readable
+from master_server.replay import Replay
 from shared.clock import monotonic_ns
 from shared.errors import CellwatchError, Refusal, WireError
 from shared.waiting import at_once_or_within, within
@@ -31,6 +33,8 @@ BODY_TIMEOUT_S = 5.0
 
 CLOSING = frozenset({401, 408, 413, 429})
 """Refused before the body was read, and nobody will read it."""
+
+IS_REPLAY = "this is a replay: nothing in it can be changed"
 
 
 async def body_of(request: Request, max_bytes: int) -> bytes:
@@ -121,10 +125,22 @@ def wants_msgpack(request: Request) -> bool:
 
 
 async def master_of(request: Request) -> Master:
-    """The one master of this application."""
+    """The one master of this application, for those who change something.
+
+    Raises:
+        Refusal: 409, it is a replay.
+    """
     master = request.app.state.master
+    if isinstance(master, Replay):
+        raise Refusal(409, IS_REPLAY)
     assert isinstance(master, Master)
     return master
+
+
+async def readable_of(request: Request) -> Readable:
+    """The master of this application, or the recording of one, for those who only read."""
+    readable: Readable = request.app.state.master
+    return readable
 
 
 def access_of(request: HTTPConnection) -> Access:
@@ -192,6 +208,7 @@ async def is_known(request: Request) -> Role:
 bearer = Depends(HTTPBearer(auto_error=False, description="The token of the units or of the operator."))
 
 MasterDependency = Annotated[Master, Depends(master_of)]
+ReadableDependency = Annotated[Readable, Depends(readable_of)]
 READERS = [bearer, Depends(may_read)]
 OPERATOR_ONLY = [bearer, Depends(is_operator)]
 UNIT_ONLY = [bearer, Depends(is_unit)]

@@ -16,7 +16,14 @@ from master_server.answers import (
     map_fields,
     unseen_fields,
 )
-from master_server.routes.common import OPERATOR_ONLY, READERS, MasterDependency, Negotiated, wants_msgpack
+from master_server.routes.common import (
+    OPERATOR_ONLY,
+    READERS,
+    MasterDependency,
+    Negotiated,
+    ReadableDependency,
+    wants_msgpack,
+)
 from shared.clock import monotonic_ns
 from shared.messages import VoxelsAnswer
 from shared.settings import Settings
@@ -28,20 +35,20 @@ router = APIRouter(tags=["map"], route_class=Negotiated)
 @router.get("/voxels", dependencies=READERS, response_model=VoxelsAnswer)
 async def voxels(
     request: Request,
-    master: MasterDependency,
+    master: ReadableDependency,
     form: Annotated[Form, Query(description="Indices (N, 3), centres (N, 3) in m, or keys (N,).")] = "indices",
     unseen: Annotated[bool, Query(description="Also the blocks that no live unit looks through.")] = False,
 ) -> Response:
     """All obstacle voxels, each with the number of units that report it, and whether that is all there is."""
     now_ns = monotonic_ns()
-    unseen_blocks = unseen_fields(master.coverage.blocks, master.seen_by(now_ns)) if unseen else None
+    unseen_blocks = unseen_fields(master.blocks_at(now_ns), master.seen_by(now_ns)) if unseen else None
     return _packed(request, map_fields(master.view(now_ns), form, unseen_blocks, now_ns))
 
 
 @router.get("/coverage", dependencies=READERS, response_model=CoverageAnswer)
 async def coverage(
     request: Request,
-    master: MasterDependency,
+    master: ReadableDependency,
     blocks: Annotated[bool, Query(description="Also by how many units each block is seen, as runs.")] = False,
 ) -> Response:
     """How much of the cell live units look through now; what none does is unseen, not free."""
@@ -49,7 +56,7 @@ async def coverage(
 
 
 @router.get("/settings", dependencies=READERS)
-async def settings(master: MasterDependency) -> Settings:
+async def settings(master: ReadableDependency) -> Settings:
     """What an operator may change while everything runs."""
     return master.settings
 

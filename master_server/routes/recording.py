@@ -22,7 +22,7 @@ async def recorder_of(request: Request) -> Recorder:
     """
     recorder = request.app.state.recorder
     if recorder is None:
-        raise Refusal(409, "recording: this master has nowhere to write to")
+        raise Refusal(409, "recording: there is nowhere to write to")
     assert isinstance(recorder, Recorder)
     return recorder
 

@@ -7,7 +7,14 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
-from master_server.routes.common import OPERATOR_ONLY, READERS, MasterDependency, Negotiated, wants_msgpack
+from master_server.routes.common import (
+    OPERATOR_ONLY,
+    READERS,
+    MasterDependency,
+    Negotiated,
+    ReadableDependency,
+    wants_msgpack,
+)
 from shared.clock import monotonic_ns
 from shared.messages import JointsRequest, RobotAnswer
 from shared.wire import MEDIA_TYPE, encode
@@ -24,7 +31,7 @@ async def put_joints(body: JointsRequest, master: MasterDependency) -> None:
 @router.get("/robot", dependencies=READERS, response_model=RobotAnswer)
 async def robot(
     request: Request,
-    master: MasterDependency,
+    master: ReadableDependency,
     since_ns: Annotated[
         int | None, Query(ge=0, lt=2**63, description="All samples after this time, not only the newest.")
     ] = None,

@@ -14,6 +14,7 @@ from master_server.routes.common import (
     UNIT_ONLY,
     MasterDependency,
     Negotiated,
+    ReadableDependency,
     bearer,
     ip_of,
     is_known,
@@ -33,7 +34,7 @@ async def initialize(body: InitializeRequest, request: Request, master: MasterDe
 
 
 @router.get("/units", dependencies=READERS)
-async def units(master: MasterDependency) -> list[UnitRow]:
+async def units(master: ReadableDependency) -> list[UnitRow]:
     """One row a unit."""
     return master.units(monotonic_ns())
 

@@ -15,7 +15,6 @@ from master_server.answers import (
     coverage_fields,
     coverage_shares,
     map_fields,
-    unit_states,
 )
 from shared.wire import pack_seen
 from tests.master_server.fakes import START_NS, S, joined, master, sees_all
@@ -53,7 +52,7 @@ def test_json_and_msgpack_say_the_same() -> None:
     one = master()
     joined(one).update(NOW_NS, [0, 411])
     fields = map_fields(one.view(NOW_NS), "centres", None, NOW_NS)
-    fields |= {"number": 1, "units": unit_states(one, NOW_NS)}
+    fields |= {"number": 1, "units": one.unit_states(NOW_NS)}
     assert json.loads(as_json(fields)) == msgpack.unpackb(as_msgpack(fields))
     message = StreamMessage.model_validate_json(as_json(fields))
     assert message.voxels == [[0.025, 0.025, 0.025], [0.075, 0.075, 0.075]]

@@ -16,31 +16,52 @@ from edge_unit.drawing import DepthBuffer, LinkDrawing, MeshBatch
 from edge_unit.hull import DISTANCE_MIN_M, hull_around
 from edge_unit.kernels import limits
 from shared.camera import Intrinsics
+from shared.cell import PlacedMesh
 from shared.kinematics import Robot
-from shared.meshes import TriangleMesh
 from shared.transforms import Transform, inverse
 
 
 class StaticLayer:
-    """The CAD and the known objects, drawn once for each camera pose and object pose; unpadded.
+    """Bodies that stand still, CAD or known objects: drawn once for each pose of theirs and the camera's; unpadded.
 
     Attributes:
         nearest_w: inverse depth (H, W) of the nearest surface, 1/m; 0 where there is none.
     """
 
-    def __init__(self, intrinsics: Intrinsics, meshes: Sequence[TriangleMesh]) -> None:
+    def __init__(self, intrinsics: Intrinsics, bodies: Sequence[PlacedMesh], batch: MeshBatch | None = None) -> None:
+        """`batch` has their meshes already."""
         self._intrinsics = intrinsics
-        self._batch = MeshBatch(intrinsics, meshes, inflate=False)
+        self._bodies = tuple(bodies)
+        self._batch = batch or MeshBatch(intrinsics, [body.mesh for body in bodies], inflate=False)
+        self._T_world_camera: Transform | None = None
         self.nearest_w = np.zeros(intrinsics.shape, np.float32)
 
-    def draw(self, T_world_camera: Transform, T_world_mesh: Sequence[Transform]) -> None:
-        """Draw all meshes anew at their poses."""
+    def of(self, bodies: Sequence[PlacedMesh]) -> StaticLayer:
+        """The layer of these bodies: this one if they stand where they stood, else a new one with the same meshes."""
+        if _stand_still(self._bodies, bodies):
+            return self
+        same_meshes = [body.mesh for body in bodies] == [body.mesh for body in self._bodies]
+        return StaticLayer(self._intrinsics, bodies, self._batch if same_meshes else None)
+
+    def draw(self, T_world_camera: Transform) -> None:
+        """Draw all bodies as the camera sees them from here, unless they are drawn so already."""
+        if self._T_world_camera is not None and np.array_equal(T_world_camera, self._T_world_camera):
+            return
+        self._T_world_camera = T_world_camera
         self.nearest_w = np.zeros(self._intrinsics.shape, np.float32)
-        if self._batch.count:
+        if self._bodies:
             buffer = DepthBuffer(self._intrinsics)
-            T_camera_mesh = inverse(T_world_camera) @ np.stack(T_world_mesh)
+            T_camera_mesh = inverse(T_world_camera) @ np.stack([body.T_world_mesh for body in self._bodies])
             self._batch.draw(T_camera_mesh, np.zeros(self._batch.count, np.float32), buffer)
             buffer.nearest_in(self.nearest_w, self._batch.rectangles)
+
+
+def _stand_still(old: Sequence[PlacedMesh], new: Sequence[PlacedMesh]) -> bool:
+    """Whether the same meshes stand at the same places; a mesh is the same only as the same object."""
+    return len(old) == len(new) and all(
+        one.mesh is other.mesh and np.array_equal(one.T_world_mesh, other.T_world_mesh)
+        for one, other in zip(old, new, strict=True)
+    )
 
 
 class RobotLayer:

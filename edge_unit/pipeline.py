@@ -25,7 +25,7 @@ from shared.clock import stage_ns
 from shared.errors import InputError
 from shared.lattice import Lattice
 from shared.settings import FilterSettings
-from shared.transforms import Transform, inverse, validated
+from shared.transforms import inverse, validated
 
 Kind = TypeVar("Kind")
 
@@ -53,7 +53,7 @@ class StageTimes:
 class DepthPipeline:
     """One camera's filter. Not for use from several threads at once.
 
-    All that changes while it runs (`apply`, `move`, `use_cell`, `use`) takes effect with the next frame.
+    All that changes while it runs (`apply`, `move`, `use_cell`, `adopt`, `use`) takes effect with the next frame.
     """
 
     def __init__(
@@ -91,7 +91,17 @@ class DepthPipeline:
         self._health = HealthCheck(intrinsics)
         self._misfit = MisfitCheck(intrinsics)
         self.static_version = 0
-        self.use_cell(cell)
+        self._voxelizer = self._voxelizer_of(cell, self.settings)
+        self._visibility = self._visibility_of(cell, self.settings)
+        self._static = StaticLayer(intrinsics, cell.static)
+        self._objects = StaticLayer(intrinsics, cell.objects)
+        self._robot = RobotLayer(intrinsics, cell.robot, self.settings.robot_padding_m)
+        self._bare_robot = BareRobot(intrinsics, cell.robot)
+        self._forget_frame()
+        self._place_links()
+        self._static.draw(self.T_world_camera)
+        self._objects.draw(self.T_world_camera)
+        self._renew_static()
 
     # ------------------------------------------------------------------ what a frame goes through
 
@@ -221,13 +231,49 @@ class DepthPipeline:
         Raises:
             InputError: these are no settings, or the lattice would be too large; the old settings stay.
         """
+        self.adopt(self.cell, settings)
+
+    def use_cell(self, cell: Cell) -> None:
+        """The cell is another from now on, or its known objects stand elsewhere.
+
+        Raises:
+            InputError: it is no cell, or its lattice would be too large; the old one stays.
+        """
+        self.adopt(cell, self.settings)
+
+    def adopt(self, cell: Cell, settings: FilterSettings) -> None:
+        """Cell and settings are others from now on: both, or neither when one of them cannot be.
+
+        Only what changed is prepared anew: robot and meshes that are the same objects as before are kept.
+
+        Raises:
+            InputError: an argument is of another type, or the lattice would be too large; the old ones stay.
+        """
+        _of_type(cell, Cell, "cell")
         _of_type(settings, FilterSettings, "settings")
-        voxelizer = Voxelizer(self.intrinsics, self.T_world_camera, self.cell.lattice(settings.voxel_size_m), settings)
-        visibility = self._look_from(self.T_world_camera, settings)
-        if settings.robot_padding_m != self.settings.robot_padding_m:
-            self._robot = RobotLayer(self.intrinsics, self.cell.robot, settings.robot_padding_m)
-        self.settings, self._voxelizer, self._visibility = settings, voxelizer, visibility
+        intrinsics, old_cell, old_settings = self.intrinsics, self.cell, self.settings
+        same_robot = cell.robot is old_cell.robot
+        voxelizer, visibility = self._voxelizer, self._visibility
+        if settings != old_settings or cell.lattice(settings.voxel_size_m) != self.lattice:
+            voxelizer = self._voxelizer_of(cell, settings)
+        if settings != old_settings or not _same_box(cell, old_cell):
+            visibility = self._visibility_of(cell, settings)
+        robot, bare_robot = self._robot, self._bare_robot
+        if not same_robot or settings.robot_padding_m != old_settings.robot_padding_m:
+            robot = RobotLayer(intrinsics, cell.robot, settings.robot_padding_m)
+        if not same_robot:
+            bare_robot = BareRobot(intrinsics, cell.robot)
+        static = self._static.of(cell.static)
+        objects = self._objects.of(cell.objects)
+        static.draw(self.T_world_camera)
+        objects.draw(self.T_world_camera)
+        # Nothing from here on can fail.
+        self.cell, self.settings = cell, settings
+        self._voxelizer, self._visibility = voxelizer, visibility
+        self._robot, self._bare_robot = robot, bare_robot
+        self._static, self._objects = static, objects
         self._forget_frame()
+        self._place_links()
         self._renew_static()
 
     def move(self, T_world_camera: ArrayLike, *, refined: bool = False) -> None:
@@ -245,29 +291,9 @@ class DepthPipeline:
         self._voxelizer.place(self.T_world_camera)
         self._visibility.place(self.T_world_camera)
         self._forget_frame()
-        self._draw_cad()
-        self._renew_static()
-
-    def use_cell(self, cell: Cell) -> None:
-        """The cell is another from now on, or its known objects stand elsewhere.
-
-        Raises:
-            InputError: it is no cell, or its lattice would be too large; the old one stays.
-        """
-        _of_type(cell, Cell, "cell")
-        voxelizer = Voxelizer(
-            self.intrinsics, self.T_world_camera, cell.lattice(self.settings.voxel_size_m), self.settings
-        )
-        self.cell = cell
-        self._voxelizer = voxelizer
-        self._visibility = self._look_from(self.T_world_camera, self.settings)
-        self._cad = StaticLayer(self.intrinsics, [placed.mesh for placed in (*cell.static, *cell.objects)])
-        self._robot = RobotLayer(self.intrinsics, cell.robot, self.settings.robot_padding_m)
-        self._bare_robot = BareRobot(self.intrinsics, cell.robot)
-        links = cell.robot.links if cell.robot else ()
-        self._fixed_links = np.array([not link.moving for link in links], np.bool_)
-        self._forget_frame()
-        self._draw_cad()
+        self._place_links()
+        self._static.draw(self.T_world_camera)
+        self._objects.draw(self.T_world_camera)
         self._renew_static()
 
     # ------------------------------------------------------------------ the stages
@@ -316,23 +342,23 @@ class DepthPipeline:
         self._robot.forget()
         self._depth_raw = self._no_depth_raw
 
-    def _draw_cad(self) -> None:
-        """Place what does not move before the camera: CAD, objects, and the robot's base."""
-        T_camera_world = inverse(self.T_world_camera)
-        self._links = Links(self.cell.robot, T_camera_world) if self.cell.robot else None
-        placed = (*self.cell.static, *self.cell.objects)
-        self._cad.draw(self.T_world_camera, [each.T_world_mesh for each in placed])
+    def _place_links(self) -> None:
+        """Place the robot's base before the camera."""
+        robot = self.cell.robot
+        self._links = Links(robot, inverse(self.T_world_camera)) if robot else None
+        self._fixed_links = np.array([not link.moving for link in (robot.links if robot else ())], np.bool_)
 
     def _renew_static(self) -> None:
         """Limits of all that stands still: CAD and what was learned, less margins, nearest over the blur of an edge."""
         settings, camera = self.settings, self.intrinsics
+        w = np.maximum(self._static.nearest_w, self._objects.nearest_w)
         learned = self.reference
         reference_m = learned.depth_m if learned else self._unlearned
         spread_m = learned.spread_m if learned else self._unlearned
         cad_noise_per_m = settings.margin_noise_gain * self._noise_per_m
         raw, scratch = self._scratch_raw
         limits.static_limit_raw(
-            self._cad.nearest_w,
+            w,
             reference_m,
             spread_m,
             settings.margin_base_m,
@@ -347,7 +373,6 @@ class DepthPipeline:
         limits.nearest_over(raw, radius_px, scratch, self._limit_raw)
         self._minimum_raw = min(max(int(np.ceil(settings.range_min_m / camera.depth_scale_m)), 1), limits.RAW_MAX)
         np.subtract(np.maximum(self._limit_raw, self._minimum_raw), self._minimum_raw, out=self._room_raw)
-        w = self._cad.nearest_w
         self._halo.renew(w, settings.static_padding_m, settings.margin_base_m, cad_noise_per_m)
         self._halo.lower(self._limit_raw, self._seen_limit_raw)
         cad_m = np.full(camera.shape, np.inf, np.float32)
@@ -357,12 +382,15 @@ class DepthPipeline:
         self._static_raw = np.where(static_raw < limits.RAW_MAX, static_raw, 0.0).astype(np.uint16)
         self.static_version += 1
 
-    def _look_from(self, T_world_camera: Transform, settings: FilterSettings) -> Visibility:
+    def _voxelizer_of(self, cell: Cell, settings: FilterSettings) -> Voxelizer:
+        return Voxelizer(self.intrinsics, self.T_world_camera, cell.lattice(settings.voxel_size_m), settings)
+
+    def _visibility_of(self, cell: Cell, settings: FilterSettings) -> Visibility:
         return Visibility(
             self.intrinsics,
-            T_world_camera,
-            self.cell.box_min_m,
-            self.cell.box_max_m,
+            self.T_world_camera,
+            cell.box_min_m,
+            cell.box_max_m,
             settings.seen_block_size_m,
             self.intrinsics.disparity_noise_m(settings.stereo_subpixel_px),
         )
@@ -389,6 +417,10 @@ class DepthPipeline:
     def _noise_per_m(self) -> float:
         """The camera's noise `c` of `sigma(z) = c * z**2`, 1/m."""
         return self.intrinsics.disparity_noise_m(self.settings.stereo_subpixel_px)
+
+
+def _same_box(one: Cell, other: Cell) -> bool:
+    return np.array_equal(one.box_min_m, other.box_min_m) and np.array_equal(one.box_max_m, other.box_max_m)
 
 
 def _of_type(value: Kind, kind: type, name: str) -> Kind:

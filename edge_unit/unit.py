@@ -284,10 +284,9 @@ class Unit:
             _warm_up(pipeline)
             self._find_background(pipeline)
         elif assignment is not applied:
-            if assignment.cell is not applied.cell:
-                pipeline.use_cell(assignment.cell)
-            if _filter_settings(assignment) != _filter_settings(applied):
-                pipeline.apply(_filter_settings(assignment))
+            settings = _filter_settings(assignment)
+            if assignment.cell is not applied.cell or settings != _filter_settings(applied):
+                pipeline.adopt(assignment.cell, settings)
             if not np.array_equal(T_world_camera, pipeline.T_world_camera):
                 pipeline.move(T_world_camera)
                 self._find_background(pipeline)
@@ -358,14 +357,17 @@ class Unit:
             voxels = pipeline.process(frame.depth, None)
         else:
             voxels = pipeline.process(frame.depth, joints.positions, joint_uncertainty_rad=joints.uncertainty)
+        seen, crowd = pipeline.seen(), None
         if len(voxels) > MAX_VOXELS:
-            return _troubled(assignment, frame, f"{len(voxels)} obstacle voxels, more than an update can hold")
+            crowd = f"{len(voxels)} obstacle voxels: the {MAX_VOXELS} nearest are reported, the rest counts as not seen"
+            voxels, beyond = voxels.nearest(pipeline.T_world_camera[:3, 3], MAX_VOXELS)
+            seen = seen.without(beyond)
         health, stance = pipeline.health(), self._judge(pipeline, frame)
         return Report(
             assignment,
             frame.captured_at_ns,
             keys_to_bytes(voxels.keys),
-            pipeline.seen(),
+            seen,
             Health(
                 valid_share=health.valid_share,
                 agreeing_share=health.agreeing_share,
@@ -375,7 +377,7 @@ class Unit:
                 frame=frame.frame_number,
                 moved=stance.moved or None,
                 blind=stance.blind or None,
-                warning=stance.warning or None,
+                warning=stance.warning or crowd,
             ),
         )
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from edge_unit.drawing import NEAR_PLANE_M
 from edge_unit.kernels import seen as kernels
+from edge_unit.voxels import Voxels
 from shared.camera import Intrinsics
 from shared.lattice import Lattice
 from shared.transforms import Transform, inverse
@@ -19,6 +21,9 @@ ROWS_LOOKED_AT = 360
 
 MAX_BLOCKS = 2**17
 """16 kB of bits before compression; in a cell that needs more, the blocks are larger."""
+
+EDGE_SHARE = 1e-3
+"""Of a voxel: how far inside of its faces it is looked at, so that rounding counts no neighbour."""
 
 SIGMAS = 2.0
 """Standard deviations of depth by which a ray must be measured behind a block; obstacles in it then show."""
@@ -40,6 +45,21 @@ class SeenBlocks:
         parts = padded.reshape(shape[0], 2, shape[1], 2, shape[2], 2)
         larger = Lattice(self.lattice.origin_m, 2.0 * self.lattice.voxel_size_m, shape)
         return SeenBlocks(parts.min(axis=(1, 3, 5)).reshape(-1), larger)
+
+    def without(self, voxels: Voxels) -> SeenBlocks:
+        """The same but for the blocks that any of the `voxels` reaches into."""
+        size_m, block_m = voxels.lattice.voxel_size_m, self.lattice.voxel_size_m
+        low_m = voxels.lattice.centres(voxels.indices) - 0.5 * size_m
+        seen = self.seen.copy()
+        grid = seen.reshape(self.lattice.shape)
+        # Along each axis no block between the first and the last is stepped over.
+        inward = EDGE_SHARE * size_m
+        steps_m = np.linspace(inward, size_m - inward, int(np.ceil(size_m / block_m)) + 1)
+        for step_m in itertools.product(steps_m, repeat=3):
+            at = np.floor((low_m + step_m - self.lattice.origin_m) / block_m).astype(np.intp)
+            x, y, z = np.clip(at, 0, np.array(self.lattice.shape) - 1).T
+            grid[x, y, z] = 0
+        return SeenBlocks(seen, self.lattice)
 
     def packed(self) -> bytes:
         """One bit a block, the first block in the lowest bit."""

@@ -40,6 +40,16 @@ class Voxels:
     def __len__(self) -> int:
         return len(self.keys)
 
+    def nearest(self, position_m: NDArray[np.float64], most: int) -> tuple[Voxels, Voxels]:
+        """At most so many of them, those nearest to a place (3,) of the world, and the others."""
+        distance_m = np.linalg.norm(self.lattice.centres(self.indices) - position_m, axis=1)
+        chosen = np.zeros(len(self), np.bool_)
+        chosen[np.argsort(distance_m, kind="stable")[:most]] = True
+        return self._only(chosen), self._only(~chosen)
+
+    def _only(self, chosen: NDArray[np.bool_]) -> Voxels:
+        return Voxels(self.keys[chosen], self.counts[chosen], self.lattice)
+
 
 class Voxelizer:
     """Counts points on a lattice as one camera sees it; its memory is taken once, for the worst frame."""

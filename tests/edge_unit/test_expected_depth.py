@@ -105,24 +105,45 @@ def test_meshes_of_a_batch_keep_to_themselves() -> None:
     intrinsics = camera(160, 90)
     meshes = [sphere_mesh("ball", 0.2), box_mesh("box", (0.2, 0.3, 0.1)), sphere_mesh("small", 0.05)]
     poses = [from_xyz_rpy((x, 0.1 * x, 1.5 + x), (x, 0.2, 0.0)) for x in (-0.5, 0.1, 0.4)]
-    together = StaticLayer(intrinsics, meshes)
-    together.draw(np.eye(4), poses)
+    bodies = [PlacedMesh(mesh.name, mesh, pose) for mesh, pose in zip(meshes, poses, strict=True)]
+    together = StaticLayer(intrinsics, bodies)
+    together.draw(np.eye(4))
     alone = np.zeros(intrinsics.shape, np.float32)
-    for mesh, pose in zip(meshes, poses, strict=True):
-        layer = StaticLayer(intrinsics, [mesh])
-        layer.draw(np.eye(4), [pose])
+    for body in bodies:
+        layer = StaticLayer(intrinsics, [body])
+        layer.draw(np.eye(4))
         alone = np.maximum(alone, layer.nearest_w)
     assert (together.nearest_w == alone).all()
 
 
 def test_the_static_layer_is_drawn_anew_each_time() -> None:
-    layer = StaticLayer(camera(160, 90), [sphere_mesh("ball", 0.2)])
-    layer.draw(np.eye(4), [from_xyz_rpy((0, 0, 1), (0, 0, 0))])
+    mesh = sphere_mesh("ball", 0.2)
+    near, far = placed("ball", mesh, (0, 0, 1)), placed("ball", mesh, (0.3, 0, 2))
+    layer = StaticLayer(camera(160, 90), [near])
+    layer.draw(np.eye(4))
     first = layer.nearest_w.copy()
-    layer.draw(np.eye(4), [from_xyz_rpy((0.3, 0, 2), (0, 0, 0))])
-    assert (layer.nearest_w != first).any()
-    layer.draw(look_at((0, 0, 0), (0, 0, -1)), [from_xyz_rpy((0, 0, 1), (0, 0, 0))])
-    assert not layer.nearest_w.any()
+    moved = layer.of([far])
+    moved.draw(np.eye(4))
+    assert (moved.nearest_w != first).any()
+    again = moved.of([near])
+    again.draw(np.eye(4))
+    assert (again.nearest_w == first).all()
+    again.draw(look_at((0, 0, 0), (0, 0, -1)))
+    assert not again.nearest_w.any()
+
+
+def test_what_stands_where_it_stood_is_not_drawn_again() -> None:
+    ball, other = sphere_mesh("ball", 0.2), box_mesh("other", (0.2, 0.2, 0.2))
+    layer = StaticLayer(camera(160, 90), [placed("ball", ball, (0, 0, 1))])
+    layer.draw(np.eye(4))
+    assert layer.of([placed("ball", ball, (0, 0, 1))]) is layer
+    picture = layer.nearest_w
+    layer.draw(np.eye(4))
+    assert layer.nearest_w is picture
+    swapped = layer.of([placed("other", other, (0, 0, 1))])
+    swapped.draw(np.eye(4))
+    assert (swapped.nearest_w != picture).any()
+    assert not layer.of([]).nearest_w.any()
 
 
 def test_the_bare_robot_forgets_where_it_was() -> None:

@@ -15,6 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from edge_unit import pipeline as pipeline_module
 from edge_unit.pipeline import DepthPipeline
 from shared.camera import Intrinsics
 from shared.cell import Cell
@@ -316,6 +317,39 @@ def test_an_object_that_moved_is_known_at_its_new_place() -> None:
     assert len(watched.process(new, [0.3])) == 0
     assert len(watched.process(old, [0.3])) > 0
     assert (watched.expected_depth([0.3]) != pipeline().expected_depth([0.3])).any()
+
+
+def test_an_object_that_moves_leaves_the_robot_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    cell = small_cell()
+    watched = pipeline(cell)
+    watched.process(look(PERSON), [0.3])
+    for name in ("RobotLayer", "BareRobot", "Voxelizer", "Visibility"):
+        monkeypatch.setattr(pipeline_module, name, None)
+    moved = cell.with_object_pose("crate", from_xyz_rpy((0.5, -0.4, 0.2), (0, 0, 0.7)))
+    watched.use_cell(moved)
+    monkeypatch.undo()
+    fresh = pipeline(moved)
+    depth = look(PERSON, cell=moved)
+    assert (watched.process(depth, [0.3]).keys == fresh.process(depth, [0.3]).keys).all()
+    assert (watched.expected_depth([0.3]) == fresh.expected_depth([0.3])).all()
+    assert (watched.seen().seen == fresh.seen().seen).all()
+
+
+def test_cell_and_settings_are_adopted_together_or_not_at_all() -> None:
+    # Too large for the settings before, so that one after the other would not do.
+    hall = replace(small_cell(), box_min_m=np.full(3, -15.0), box_max_m=np.full(3, 15.0))
+    watched = pipeline()
+    cell, before = watched.cell, watched.process(look(PERSON), [0.3])
+    for voxel_size_m in (0.05, 0.04):
+        with pytest.raises(InputError, match="choose larger voxels"):
+            watched.adopt(hall, FilterSettings(voxel_size_m=voxel_size_m))
+        assert (watched.cell, watched.settings) == (cell, FilterSettings())
+        assert (watched.process(look(PERSON), [0.3]).keys == before.keys).all()
+    watched.adopt(hall, FilterSettings(voxel_size_m=0.1, robot_padding_m=0.08))
+    fresh = pipeline(hall, voxel_size_m=0.1, robot_padding_m=0.08)
+    assert watched.lattice == fresh.lattice
+    assert (watched.process(look(PERSON), [0.3]).keys == fresh.process(look(PERSON), [0.3]).keys).all()
+    assert (watched.seen().seen == fresh.seen().seen).all()
 
 
 def test_another_pose_of_the_camera() -> None:

@@ -154,6 +154,35 @@ async def test_from_frame_to_map(tmp_path: Path) -> None:
     assert bench.source.closed >= 1
 
 
+async def test_of_too_many_voxels_the_nearest_are_reported_and_the_rest_is_not_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Two plates at different heights: the nearer one is 1.05 m below the camera, at z of 0.45 m.
+    depth = patch(1225)
+    depth[:, :16] = 1050
+    bench = await asyncio.to_thread(Bench, tmp_path)
+    async with bench.running():
+        bench.show(depth)
+        row = await bench.until_state("live")
+        everything, all_seen = bench.voxels(), bench.master.seen_by(monotonic_ns())
+        assert row.reason == ""
+        near = {index for index in everything if index[2] == 9}
+        assert 20 <= len(near) < len(everything)
+        monkeypatch.setattr(unit_module, "MAX_VOXELS", len(near))
+        bench.show(depth)
+        warning = (
+            f"{len(everything)} obstacle voxels: the {len(near)} nearest are reported, the rest counts as not seen"
+        )
+        row = await bench.until(lambda: (row := bench.row()) and row.reason and row, "a warning")
+        assert (row.state, row.reason) == ("live", warning)
+        assert bench.voxels() == near
+        seen = bench.master.seen_by(monotonic_ns())
+        assert (seen <= all_seen).all()
+        for x, y, z in everything - near:
+            assert seen[x // 2, y // 2, z // 2] == 0
+        assert bench.master.view(monotonic_ns()).complete
+
+
 async def test_what_is_seen_goes_along_only_when_it_changed(tmp_path: Path) -> None:
     bench = await asyncio.to_thread(Bench, tmp_path)
     reports = []

@@ -6,6 +6,7 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_unit.visibility import MAX_BLOCKS, SeenBlocks, Visibility
+from edge_unit.voxels import Voxels
 from shared.lattice import Lattice
 from shared.transforms import apply, inverse, look_at
 from tests.edge_unit.scenes import camera
@@ -34,6 +35,24 @@ def test_blocks_before_a_wall_are_seen_and_those_behind_are_not() -> None:
     everything = look(FAR)
     beyond = depth_of(everything) < 1.2 - 0.09
     assert wall.seen.sum() >= beyond.sum()
+
+
+@pytest.mark.parametrize("voxel_size_m", [0.03, 0.05, 0.1, 0.25])
+@pytest.mark.parametrize("block_size_m", [0.05, 0.1, 0.14])
+def test_blocks_that_hold_part_of_a_voxel_can_be_taken_out(voxel_size_m: float, block_size_m: float) -> None:
+    blocks = Lattice.covering(*BOX_M, block_size_m)
+    voxel = Lattice.covering(*BOX_M, voxel_size_m)
+    keys = np.array([0, 7, voxel.cell_count // 2, voxel.cell_count - 1], np.uint32)
+    voxels = Voxels(keys, np.ones(4, np.uint32), voxel)
+    everything = SeenBlocks(np.ones(blocks.cell_count, np.uint8), blocks)
+    left = everything.without(voxels)
+    # A block and a voxel overlap when they do on each axis; more than by rounding.
+    low_m = np.array(voxel.origin_m) + voxels.indices * voxel_size_m + 1e-6
+    high_m = low_m + voxel_size_m - 2e-6
+    block_low_m = np.array(blocks.origin_m) + np.argwhere(np.ones(blocks.shape)) * blocks.voxel_size_m
+    overlap = (block_low_m[:, None] < high_m) & (block_low_m[:, None] + blocks.voxel_size_m > low_m)
+    assert (left.seen == ~overlap.all(axis=2).any(axis=1)).all()
+    assert everything.seen.all()
 
 
 def test_blocks_that_are_seen_lie_wholly_in_the_picture() -> None:

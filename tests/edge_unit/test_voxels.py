@@ -169,3 +169,21 @@ def test_the_angular_model_asks_for_more_than_the_pinhole() -> None:
     for model, number in (("pinhole", 1), ("angular", 0)):
         settings = {"density_rule": "single", "density_model": model, "occupancy_threshold": 0.9}
         assert len(found(FilterSettings.model_validate(settings), depth, intrinsics)) == number
+
+
+def test_the_nearest_of_too_many_are_chosen() -> None:
+    lattice = Lattice((0.0, 0.0, 0.0), 0.1, (10, 10, 10))
+    keys = np.arange(0, 1000, 3, dtype=np.uint32)
+    voxels = Voxels(keys, keys + 1, lattice)
+    position_m = np.array((0.2, 0.3, -1.0))
+    near, others = voxels.nearest(position_m, 100)
+    assert (len(near), len(others)) == (100, len(keys) - 100)
+    assert (np.sort(np.concatenate((near.keys, others.keys))) == keys).all()
+    assert (np.diff(near.keys.astype(int)) > 0).all()
+    assert (near.counts == near.keys + 1).all()
+
+    def distance_m(some: Voxels) -> NDArray[np.float64]:
+        return np.asarray(np.linalg.norm(lattice.centres(some.indices) - position_m, axis=1))
+
+    assert distance_m(near).max() <= distance_m(others).min()
+    assert len(voxels.nearest(position_m, 10_000)[1]) == 0

@@ -17,7 +17,7 @@ import ssl
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import uvicorn
 
@@ -26,6 +26,7 @@ from master_server.app import Application, make_app, make_replay_app
 from master_server.config import ENVIRONMENT_PREFIX, MasterConfig, ReplayConfig, ServerConfig
 from master_server.connections import Acceptor, GuardedHttp, fingerprint, quiet, server_context
 from master_server.limits import Limits
+from master_server.logs import LogFormat, LogLevel, configure
 from master_server.master import Master
 from master_server.recorded import Progress, Recording, summary
 from master_server.recording import Recorder
@@ -43,7 +44,8 @@ STOP_S = 1
 BACKLOG = 256
 """Units that connect in the same moment, as after a power cut, with room to spare."""
 
-LISTENING = ("host", "port", "state_dir", "ready_file", "public_reads", "tls_certificate", "tls_key")
+LOGGING = ("log_level", "log_format")
+LISTENING = ("host", "port", "state_dir", "ready_file", "public_reads", "tls_certificate", "tls_key", *LOGGING)
 REPLAY_OPTIONS = ("file", "speed", "start_s", "loop", *LISTENING)
 
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -58,7 +60,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = PARSERS[given[0]]().parse_args(given[1:])
     else:
         options = _parser().parse_args(given)
-    logging.basicConfig(level=options.log_level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     try:
         options.run(options)
     except CellwatchError as error:
@@ -113,6 +114,7 @@ class _Server(uvicorn.Server):
 
 def _serve_master(options: argparse.Namespace) -> None:
     config = _config(options)
+    configure(config.log_level, config.log_format)
     master = Master(Cell.load(config.cell), config.settings)
     recorder = Recorder(master, config.recording, config.state_dir / "recordings")
     _serve(config, lambda access, limits: make_app(master, access, recorder, limits))
@@ -120,6 +122,7 @@ def _serve_master(options: argparse.Namespace) -> None:
 
 def _serve_replay(options: argparse.Namespace) -> None:
     config = load(ReplayConfig, None, os.environ, ENVIRONMENT_PREFIX, _overrides(options, REPLAY_OPTIONS))
+    configure(config.log_level, config.log_format)
     with Recording(config.file, _progress(config.file)) as recording:
         if recording.trouble:
             logger.warning("%s: %s", config.file, recording.trouble)
@@ -128,6 +131,7 @@ def _serve_replay(options: argparse.Namespace) -> None:
 
 
 def _tell_recording(options: argparse.Namespace) -> None:
+    configure(options.log_level or "INFO", options.log_format or "text")
     with Recording(options.file, _progress(options.file)) as recording:
         print("\n".join(summary(recording)))
 
@@ -250,7 +254,7 @@ def _info_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="master-server recording-info", description="Tell what is in a recording.")
     parser.set_defaults(run=_tell_recording)
     parser.add_argument("file", type=Path, help="a recording (.mcap)")
-    _add_log_level(parser)
+    _add_log_options(parser)
     return parser
 
 
@@ -265,11 +269,12 @@ def _add_server_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="any other, as in settings.voxel_size_m=0.03"
     )
-    _add_log_level(parser)
+    _add_log_options(parser)
 
 
-def _add_log_level(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--log-level", default="INFO", choices=("DEBUG", "INFO", "WARNING", "ERROR"))
+def _add_log_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--log-level", choices=get_args(LogLevel), help="the least that is logged (default: INFO)")
+    parser.add_argument("--log-format", choices=get_args(LogFormat), help="lines as text or as JSON (default: text)")
 
 
 def _seconds(text: str) -> float:

@@ -8,7 +8,6 @@ from contextlib import asynccontextmanager
 
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -21,7 +20,7 @@ from master_server.readable import Readable
 from master_server.recording import Recorder
 from master_server.replay import Replay
 from master_server.routes import cell, health, map, recording, replay, robot, stream, units
-from master_server.routes.common import ip_of, refused
+from master_server.routes.common import ip_of, log_refusal, refused
 from master_server.routes.replay import RefusedUpdate
 from master_server.routes.update import UpdateEndpoint
 from master_server.stream import Stream
@@ -145,6 +144,7 @@ def _assembled(
 
 async def _refused(request: Request, error: Exception) -> Response:
     assert isinstance(error, CellwatchError)
+    log_refusal(request.scope, error)
     return refused(error)
 
 
@@ -153,5 +153,7 @@ async def _invalid(request: Request, error: Exception) -> Response:
     items = error.errors()
     if items and items[0]["type"] == "json_invalid":
         reason = items[0].get("ctx", {}).get("error", "it is malformed")
-        return JSONResponse({"detail": f"body: expected JSON, got none: {reason} at {items[0]['loc'][-1]}"}, 422)
-    return JSONResponse({"detail": sentence_of(items)}, 422)
+        sentence = f"body: expected JSON, got none: {reason} at {items[0]['loc'][-1]}"
+    else:
+        sentence = sentence_of(items)
+    return await _refused(request, Refusal(422, sentence))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from master_server.logs import LogFormat, LogLevel
 from master_server.recording import RecordingConfig
 from master_server.replay import SPEED_MAX, SPEED_MIN
 from shared.settings import Settings
@@ -36,6 +37,8 @@ class ServerConfig(BaseModel):
     tls_key: Path | None = Field(default=None, description="Of the certificate, in PEM, without a password.")
     state_dir: Path = Field(default_factory=default_state_dir, description="Where tokens are kept.")
     public_reads: bool = Field(default=False, description="Whether reading needs no token.")
+    log_level: LogLevel = Field(default="INFO", description="The least that is logged.")
+    log_format: LogFormat = Field(default="text", description="Lines for people, or JSON for a collector.")
     ready_file: Path | None = Field(
         default=None, description="Written as JSON (url, port, pid, token files) when the master can be asked."
     )

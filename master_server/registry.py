@@ -121,7 +121,17 @@ class Slot:
             self.asked.remove(asked)
             verb = asked.command.verb
             level = logging.DEBUG if verb == "image" else logging.INFO
-            logger.log(level, "unit %d (%s): command %d, %s: %s", self.id, self.ip, outcome.id, verb, outcome.text)
+            fields = {**self.log_fields("command"), "verb": verb}
+            logger.log(
+                level,
+                "unit %d (%s): command %d, %s: %s",
+                self.id,
+                self.ip,
+                outcome.id,
+                verb,
+                outcome.text,
+                extra=fields,
+            )
             if self.last_command is not None and self.last_command.id == outcome.id:
                 self.last_command = self.last_command.model_copy(update={"outcome": outcome.text})
 

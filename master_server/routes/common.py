@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Coroutine
 from typing import Annotated, Any
 
@@ -25,6 +26,8 @@ from shared.errors import CellwatchError, Refusal, WireError
 from shared.waiting import at_once_or_within, within
 from shared.wire import MEDIA_TYPE, unpack
 
+logger = logging.getLogger(__name__)
+
 MAX_BODY_BYTES = 2**18
 """Of any request but updates, cells and meshes: settings, a pose, joints."""
 
@@ -33,6 +36,8 @@ BODY_TIMEOUT_S = 5.0
 
 CLOSING = frozenset({401, 408, 413, 429})
 """Refused before the body was read, and nobody will read it."""
+SHOWN_PATH_CHARS = 100
+"""More than the longest path that the master has."""
 
 IS_REPLAY = "this is a replay: nothing in it can be changed"
 
@@ -88,13 +93,30 @@ def ip_of(scope: Scope) -> str:
     return plain_ip(str(client[0]))
 
 
+def status_of(error: CellwatchError) -> int:
+    """The HTTP status of a refusal; what is not one by itself is wrong input."""
+    return error.status if isinstance(error, Refusal) else 422
+
+
 def refused(error: CellwatchError) -> Response:
     """A refusal as every route answers it: one sentence."""
-    status = error.status if isinstance(error, Refusal) else 422
+    status = status_of(error)
     headers = {"Connection": "close"} if status in CLOSING else {}
     if isinstance(error, Refusal) and error.retry_after_s is not None:
         headers["Retry-After"] = str(error.retry_after_s)
     return JSONResponse({"detail": str(error)}, status, headers)
+
+
+def log_refusal(scope: Scope, error: CellwatchError) -> None:
+    """One line for whoever wonders why a request was refused; without the query, which is the caller's own affair."""
+    status = status_of(error)
+    client = scope.get("client")
+    ip = plain_ip(str(client[0])) if client else ""
+    # A stranger may ask for any path.
+    path = repr(scope["path"])[1:-1][:SHOWN_PATH_CHARS]
+    asked = f"{scope.get('method', 'WS')} {path}"
+    fields = {"event": "refusal", "ip": ip, "status": status}
+    logger.warning("%s from %s refused: %d, %s", asked, ip, status, error, extra=fields)
 
 
 class Negotiated(APIRoute):

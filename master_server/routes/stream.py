@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from master_server.access import ANYONE
 from master_server.answers import Form
-from master_server.routes.common import access_of, ip_of, refused, role_of
+from master_server.routes.common import access_of, ip_of, log_refusal, refused, role_of
 from master_server.stream import Listener, Stream, Wish
 from shared.configuration import sentence
 from shared.errors import Refusal
@@ -47,10 +47,12 @@ async def stream(websocket: WebSocket) -> None:
     source = websocket.app.state.stream
     assert isinstance(source, Stream)
     try:
+        _refuse_token(websocket)
         if not access_of(websocket).public_reads:
             role_of(websocket, ANYONE, _authorization(websocket))
         listener = source.listen(_wish(websocket))
     except Refusal as refusal:
+        log_refusal(websocket.scope, refusal)
         await websocket.send_denial_response(refused(refusal))
         return
     fields = {"event": "stream", "ip": ip_of(websocket.scope)}
@@ -97,9 +99,13 @@ def _authorization(websocket: WebSocket) -> bytes | None:
     return None
 
 
-def _wish(websocket: WebSocket) -> Wish:
+def _refuse_token(websocket: WebSocket) -> None:
+    """Whoever puts a token here learns it at once, whether it is the right one or not."""
     if "token" in websocket.query_params:
         raise Refusal(400, "token: expected in the Authorization header or as subprotocol bearer.<token>, not here")
+
+
+def _wish(websocket: WebSocket) -> Wish:
     try:
         query = StreamQuery.model_validate(dict(websocket.query_params))
     except ValidationError as error:

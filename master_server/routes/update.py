@@ -12,7 +12,7 @@ from starlette.types import Receive, Scope, Send
 from master_server.access import UNITS
 from master_server.master import Master
 from master_server.metrics import Metrics
-from master_server.routes.common import body_of, ip_of, refused, role_of
+from master_server.routes.common import body_of, ip_of, log_refusal, refused, role_of, status_of
 from shared.clock import monotonic_ns
 from shared.errors import Refusal, WireError
 from shared.wire import MAX_UPDATE_BYTES, MEDIA_TYPE, decode_update, encode_update_answer
@@ -32,7 +32,8 @@ class UpdateEndpoint:
         try:
             body = await self._answer(request)
         except (Refusal, WireError) as error:
-            self._metrics.refused(error.status if isinstance(error, Refusal) else 422)
+            self._metrics.refused(status_of(error))
+            log_refusal(scope, error)
             await refused(error)(scope, receive, send)
         else:
             length = (b"content-length", str(len(body)).encode())

@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps source-faults bench-pipeline bench-master pictures test lint clean libusb
+.PHONY: help demo real sweeps source-faults bench-pipeline bench-board bench-master pictures test lint clean libusb
 
 ARGS ?=
 EXTRAS := edge,master,realsense,sim,dev
@@ -40,6 +40,9 @@ bench-pipeline: $(BENCH_READY) libusb ## what a frame costs, beside Open3D, Octo
 
 bench-master: $(READY) ## how many units one master bears, beside a bare route of FastAPI
 	@$(BIN)/python -m benchmarks.master $(ARGS)
+
+bench-board: $(READY) ## how well a camera's pose is found by a calibration board, by distance
+	@$(BIN)/python -m benchmarks.board $(ARGS)
 
 pictures: $(READY) ## the pictures of the README, painted anew
 	@$(BIN)/python -m simulation.picture assets/pictures/demo.png

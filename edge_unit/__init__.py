@@ -19,6 +19,10 @@ In the order of the flow:
     health          does what the camera sees still fit what it should see
     misfit          how badly a frame fits from where the camera should be, and from close by
     pipeline        the method, one line a stage
+    board_layout    the calibration board on paper: what is printed where
+    board_detection the board in one picture: which of its points are seen, and where
+    pose_mean       the mean of many measurements of one pose
+    localise        the camera's pose by the board: pictures in, pose out
     joints          the robot's joints at a frame's time
     trust           which master a unit believes, by its certificate
     client          what a unit can ask the master

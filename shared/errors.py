@@ -9,6 +9,7 @@
         KinematicsError     ... in a robot description
       SourceError           a camera or a recording does not deliver
         SourceEnded         ... because it has come to its end
+      BoardError            the calibration board, as it is seen, does not tell the camera's pose
       WireError             bytes from the network are no message of ours
       UplinkError           the exchange between unit and master failed
         MasterUnreachable   ... nobody answered
@@ -53,6 +54,10 @@ class SourceError(CellwatchError):
 
 class SourceEnded(SourceError):
     """A recording has come to its end."""
+
+
+class BoardError(CellwatchError):
+    """The calibration board is not seen, or not well enough to tell the camera's pose; says what to do."""
 
 
 class WireError(CellwatchError):

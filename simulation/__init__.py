@@ -12,6 +12,7 @@ and tests need no clock. In the order of the flow:
     raycast      true depth, independent: rays cast by Embree
     depth_noise  the faults of a stereo depth camera
     truth        which voxels should be reported, and which must not
+    board_picture what a camera's picture shows of the calibration board
     camera       a depth camera in the world, and where a cell's cameras hang
     controller   the robot's controller: reports its joints to the master
     warm_up      compiles what a simulated unit needs, once for many

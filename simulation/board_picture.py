@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a camera's picture shows of the calibration board: perspective, antialiased, blurred, with noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_unit.board_layout import BoardLayout
+from shared.camera import Intrinsics
+from shared.transforms import Transform, apply, inverse
+
+TEXTURE_PX_PER_M = 8000.0
+TEXTURE_MAX_PX = 6000
+"""A board is drawn once at 0.125 mm a pixel, with exact grey at its edges, or coarser if it is large."""
+
+SUPERSAMPLING = 4
+"""Rays along each side of a pixel."""
+
+MARGIN_SQUARES = 0.5
+"""White paper about the pattern."""
+
+
+@dataclass(frozen=True)
+class PictureQuality:
+    """Grey values 0 to 255 before noise; `blur_px` and `noise` are standard deviations."""
+
+    white: float = 200.0
+    black: float = 25.0
+    surroundings: float = 105.0
+    blur_px: float = 0.6
+    noise: float = 2.0
+
+
+class BoardPicture:
+    """Draws one board as one camera sees it."""
+
+    def __init__(self, layout: BoardLayout, intrinsics: Intrinsics, quality: PictureQuality | None = None) -> None:
+        self._intrinsics = intrinsics
+        self._quality = quality or PictureQuality()
+        self._margin_m = MARGIN_SQUARES * layout.board.square_m
+        width_m, height_m = (side + 2.0 * self._margin_m for side in layout.size_m)
+        self._size_m = width_m, height_m
+        self._px_per_m = min(TEXTURE_PX_PER_M, TEXTURE_MAX_PX / max(width_m, height_m))
+        self._texture = self._drawn(layout)
+
+    def expose(self, T_camera_board: Transform, hidden: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+        """The picture (H, W) float32 without noise; the board is not seen where `hidden` (H, W), nor from behind."""
+        camera, quality = self._intrinsics, self._quality
+        image = np.full(camera.shape, quality.surroundings, dtype=np.float32)
+        (width_m, height_m), margin_m = self._size_m, self._margin_m
+        outline_m = np.array(((0, 0, 0), (width_m, 0, 0), (width_m, height_m, 0), (0, height_m, 0))) - (
+            margin_m,
+            margin_m,
+            0.0,
+        )
+        corners = apply(T_camera_board, outline_m)
+        eye_m = inverse(T_camera_board)[:3, 3]
+        if corners[:, 2].min() < 0.05 or eye_m[2] >= 0.0:
+            return image
+        pixels = camera.project(corners)
+        first = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - 4, 0)
+        last = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 5, (camera.width, camera.height))
+        if (last <= first).any():
+            return image
+        width, height = last - first
+        s = float(SUPERSAMPLING)
+        # A pixel's centre is at integer coordinates, on either grid.
+        fine_of_pixel = np.array(
+            ((s, 0.0, 0.5 * (s - 1.0) - s * first[0]), (0.0, s, 0.5 * (s - 1.0) - s * first[1]), (0.0, 0.0, 1.0))
+        )
+        pixel_of_camera = np.array(((camera.fx, 0.0, camera.cx), (0.0, camera.fy, camera.cy), (0.0, 0.0, 1.0)))
+        step_m = 1.0 / self._px_per_m
+        board_of_texture = np.array(
+            ((step_m, 0.0, 0.5 * step_m - margin_m), (0.0, step_m, 0.5 * step_m - margin_m), (0.0, 0.0, 1.0))
+        )
+        camera_of_board = T_camera_board[:3][:, [0, 1, 3]]
+        homography = fine_of_pixel @ pixel_of_camera @ camera_of_board @ board_of_texture
+        fine = cv2.warpPerspective(
+            self._texture,
+            homography,
+            (int(width) * SUPERSAMPLING, int(height) * SUPERSAMPLING),
+            flags=cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=quality.surroundings,
+        )
+        seen = cv2.resize(fine, (int(width), int(height)), interpolation=cv2.INTER_AREA)
+        part = image[first[1] : last[1], first[0] : last[0]]
+        np.copyto(part, seen)
+        if hidden is not None:
+            image[hidden] = quality.surroundings
+        if quality.blur_px > 0.0:
+            # Beyond the board all is grey, so its surroundings need no blur.
+            part[:] = cv2.GaussianBlur(part, (0, 0), quality.blur_px)
+        return image
+
+    def develop(self, exposed: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint8]:
+        """A frame (H, W) uint8 of the picture, with noise of its own."""
+        noise = rng.standard_normal(exposed.shape, dtype=np.float32) * np.float32(self._quality.noise)
+        return np.asarray(np.clip(exposed + noise + 0.5, 0.0, 255.0), dtype=np.uint8)
+
+    def _drawn(self, layout: BoardLayout) -> NDArray[np.float32]:
+        """The board with its margin, (H, W) float32: each pixel the mean of what it covers."""
+        px = self._px_per_m
+        width, height = (round(side * px) for side in self._size_m)
+        black = np.zeros((height, width), dtype=np.float32)
+        for x0, y0, x1, y1 in (layout.black_m + self._margin_m) * px:
+            columns, across = _covered(x0, x1)
+            rows, down = _covered(y0, y1)
+            black[rows, columns] += np.outer(down, across)
+        quality = self._quality
+        return np.asarray(quality.white + (quality.black - quality.white) * black, dtype=np.float32)
+
+
+def _covered(low: float, high: float) -> tuple[slice, NDArray[np.float32]]:
+    """Which pixels an interval touches, and how much of each."""
+    first, last = int(np.floor(low)), int(np.ceil(high))
+    edges = np.arange(first, last + 1)
+    covered = np.diff(np.clip(edges, low, high)).astype(np.float32)
+    return slice(first, last), covered

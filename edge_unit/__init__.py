@@ -21,6 +21,7 @@ In the order of the flow:
     pipeline        the method, one line a stage
     board_layout    the calibration board on paper: what is printed where
     board_detection the board in one picture: which of its points are seen, and where
+    board_print     the board as a PDF at exact scale
     pose_mean       the mean of many measurements of one pose
     localise        the camera's pose by the board: pictures in, pose out
     joints          the robot's joints at a frame's time

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `run` watches until told to stop, `doctor` looks for what is wrong, `record-images` records."""
+"""The command line: `run` watches until told to stop, `doctor` looks for what is wrong, and two more.
+
+`record-images` makes a recording of images, `board` a PDF of the calibration board.
+"""
 
 from __future__ import annotations
 
@@ -76,6 +79,20 @@ def _record_images(options: argparse.Namespace) -> int:
     return 0
 
 
+def _board(options: argparse.Namespace) -> int:
+    from edge_unit.board_layout import BoardLayout, require_board
+    from edge_unit.board_print import page_of, smallest_page, write_board
+    from shared.cell import board_of
+    from shared.cell_file import read_cell_file
+
+    # Only what the file says of the board: what else it names need not be on this computer.
+    layout = BoardLayout.of(require_board(board_of(read_cell_file(options.cell))))
+    page = page_of(layout, options.page or smallest_page(layout))
+    write_board(layout, options.out, page)
+    print(f"{options.out}: one page of {page.name}; print it at 100 % and measure the ruler")
+    return 0
+
+
 async def _until_told_to_stop(work: Coroutine[None, None, None]) -> None:
     """Run to the end, or to a signal."""
     task = asyncio.ensure_future(work)
@@ -90,6 +107,7 @@ async def _until_told_to_stop(work: Coroutine[None, None, None]) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="edge-unit", description="The edge unit: one depth camera, one master.")
+    levels = ("DEBUG", "INFO", "WARNING", "ERROR")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     variables = f"Every value may also be a variable, as in {ENVIRONMENT_PREFIX}MASTER_URL=http://10.0.0.2:8420."
     run = commands.add_parser("run", help="watch and report until told to stop", epilog=variables)
@@ -104,11 +122,16 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("folder", metavar="DIR", help="16-bit PNG or npz images in depth/, with camera_info.yaml")
     record.add_argument("recording", type=Path, metavar="OUT.db3")
     record.add_argument("--fps", type=float, default=15.0, help="its pace, also that of writing it (default 15)")
+    board = commands.add_parser("board", help="the cell's calibration board as a PDF to be printed")
+    board.set_defaults(command=_board)
+    board.add_argument("--cell", type=Path, required=True, metavar="CELL.YAML", help="the cell that has the board")
+    board.add_argument("--out", type=Path, required=True, metavar="BOARD.PDF")
+    board.add_argument("--page", help="A4 to A0 (default: the smallest that the board fits on)")
+    board.add_argument("--log-level", default="WARNING", choices=levels)
     for each in (run, doctor, record):
         each.add_argument(
             "--set", action="append", default=[], metavar="NAME=VALUE", help="one value of the configuration"
         )
-    levels = ("DEBUG", "INFO", "WARNING", "ERROR")
     run.add_argument("--log-level", default="INFO", choices=levels)
     doctor.add_argument("--log-level", default="ERROR", choices=levels)
     record.add_argument("--log-level", default="WARNING", choices=levels)

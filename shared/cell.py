@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from shared.cell_file import MAX_BODIES, BoardFile, DHFile, Name, RobotFile, ShapeFile, named_file, read_cell_file
+from shared.cell_file import MAX_BODIES, CellFile, DHFile, Name, RobotFile, ShapeFile, named_file, read_cell_file
 from shared.configuration import sentence
 from shared.errors import CellError, InputError, KinematicsError, MeshError
 from shared.joint_table import DHJoint
@@ -153,7 +153,7 @@ class Cell:
                     for i, body in enumerate(content.objects)
                 ),
                 None if content.robot is None else _robot(file, content.robot),
-                None if content.board is None else _board(content.board),
+                board_of(content),
             )
         except InputError as error:
             raise CellError(f"{file}: {error}") from error
@@ -360,6 +360,9 @@ def _urdf_robot(file: Path, content: RobotFile, tool: TriangleMesh | None, T_wor
     )
 
 
-def _board(content: BoardFile) -> Board:
-    fields = content.model_dump(exclude={"pose"})
-    return Board(**fields, T_world_board=content.pose.transform())
+def board_of(content: CellFile) -> Board | None:
+    """The board that a cell file describes."""
+    if content.board is None:
+        return None
+    fields = content.board.model_dump(exclude={"pose"})
+    return Board(**fields, T_world_board=content.board.pose.transform())

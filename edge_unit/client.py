@@ -26,8 +26,11 @@ from shared.messages import (
 from shared.transforms import Transform
 from shared.wire import MAX_ANSWER_BYTES, MEDIA_TYPE, decode, decode_update_answer, encode, encode_update, unpack
 
-TIMEOUT = httpx.Timeout(2.0, connect=1.0)
-"""A master that takes longer is as good as gone: the next frame is worth more than the answer to this one."""
+TIMEOUT = httpx.Timeout(2.0, connect=0.5)
+"""A master that takes longer is as good as gone: the next frame is worth more than the answer to this one.
+
+A connection that is asked for while the network is cut does not come when it heals, for the kernel asks again only
+after a second: so ask for another one before."""
 
 TRANSFER_TIMEOUT_S = 30.0
 """For a mesh of MAX_MESH_BYTES over a network that is slow but works."""

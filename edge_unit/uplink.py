@@ -48,8 +48,8 @@ HEARTBEAT_S = 0.2
 """Without a new frame the last report is sent again, often enough for the shortest sensible staleness."""
 
 RETRY_MIN_S = 0.05
-RETRY_MAX_S = 0.5
-"""A master that returns has its units back within a second."""
+RETRY_MAX_S = 0.25
+"""A master that returns has its units back within a second, a connection just asked for in vain included."""
 
 JOINTS_TIMEOUT_S = 0.02
 """For joints newer than the last update brought; a frame is not held up longer for them."""

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from edge_unit import uplink as module
+from edge_unit.client import TIMEOUT
 from edge_unit.sources.frame import CameraInfo
 from edge_unit.uplink import Report, Uplink, seen_report
 from edge_unit.visibility import SeenBlocks
@@ -344,3 +345,9 @@ def test_what_would_be_too_long_is_told_in_larger_blocks() -> None:
     for index in np.argwhere(coarse)[:100]:
         low = 2 * index
         assert noise[tuple(slice(a, a + 2) for a in low)].all()
+
+
+def test_a_cut_that_heals_at_the_worst_moment_costs_less_than_a_second() -> None:
+    assert TIMEOUT.connect is not None
+    # A connection asked for just before, the longest pause behind it, and a fifth of a second to register and report.
+    assert TIMEOUT.connect + 1.2 * module.RETRY_MAX_S + 0.2 <= 1.0

@@ -27,6 +27,7 @@ from edge_unit.config import SourceConfig, UnitConfig
 from edge_unit.joints import JointEstimate
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.reference import ReferenceLearner
+from edge_unit.rehearsal import rehearse
 from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
 from edge_unit.sources.realsense import RealsenseSource, RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
@@ -50,6 +51,9 @@ LEARN_FRAMES = 60
 REOPEN_MIN_S = 0.2
 REOPEN_MAX_S = 5.0
 """Between attempts to open a camera that does not deliver."""
+
+REHEARSAL_S = 5.0
+"""For kernels to be read from disk, on a busy machine."""
 
 DRAIN_S = 2.0
 """For the last frame of a recording to reach the master."""
@@ -96,6 +100,7 @@ class Unit:
         self._pipeline: DepthPipeline | None = None
         self._applied: Assignment | None = None
         self._learning: _Learning | None = None
+        self._rehearsal: asyncio.Task[None] | None = None
         self._next_at_ns = 0
         self._trouble: str | None = "no frame yet"
         self.uplink = Uplink(
@@ -164,7 +169,11 @@ class Unit:
             retry_s = min(2.0 * retry_s, REOPEN_MAX_S)
 
     async def _open(self) -> None:
+        if self._rehearsal is None:
+            self._rehearsal = asyncio.create_task(asyncio.to_thread(rehearse))
         camera = await self._source.open()
+        # Who registers is live with the next frame; but a unit that has to compile first tells that it is there.
+        await asyncio.wait((self._rehearsal,), timeout=REHEARSAL_S)
         if self._camera is not None and camera.serial != self._camera.serial:
             logger.warning("the camera changed from %s to %s", self._camera.serial, camera.serial)
         self._camera, self._pipeline, self._applied = camera, None, None
@@ -172,7 +181,7 @@ class Unit:
         self.uplink.set_camera(camera, self._pose or (None if pose is None else (pose, "source")))
         self.uplink.trouble = None
         await asyncio.to_thread(self._memory.save, camera)
-        await self.uplink.assigned.wait()
+        await asyncio.gather(self.uplink.assigned.wait(), self._rehearsal)
         assignment = self.uplink.assignment
         if assignment is not None and assignment.T_world_camera is not None:
             # Before the camera delivers, so that no frame has to wait for what is compiled and drawn only once.

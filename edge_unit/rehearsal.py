@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every kernel, compiled or read from disk before the first frame, and before anyone knows where the camera stands."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge_unit.pipeline import DepthPipeline
+from shared.camera import Intrinsics
+from shared.cell import Cell, PlacedMesh
+from shared.joint_table import DHJoint
+from shared.kinematics import Robot
+from shared.meshes import box_mesh
+from shared.transforms import from_xyz_rpy, identity
+
+CAMERA = Intrinsics(64, 48, 60.0, 60.0, 31.5, 23.5)
+"""Kernels are compiled for types, not for sizes."""
+
+DEPTH_MM = 1000
+
+
+def rehearse() -> None:
+    """Run the pipeline once before a cell that has a wall and a robot, whatever the true one has."""
+    wall = PlacedMesh("wall", box_mesh("wall", (2.0, 2.0, 0.1)), from_xyz_rpy((0.0, 0.0, 3.0), np.zeros(3)))
+    robot = Robot.from_dh(
+        [DHJoint("joint")],
+        [None, box_mesh("link", (0.2, 0.2, 0.2))],
+        T_world_base=from_xyz_rpy((0.0, 0.0, 2.0), np.zeros(3)),
+    )
+    cell = Cell("rehearsal", np.full(3, -1.0), np.full(3, 2.0), static=(wall,), robot=robot)
+    pipeline = DepthPipeline(CAMERA, identity(), cell)
+    for joint_rad in (0.0, 0.1):
+        pipeline.process(np.full(CAMERA.shape, DEPTH_MM, np.uint16), np.array([joint_rad]))
+    pipeline.health()
+    pipeline.seen()

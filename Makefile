@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps source-faults bench-pipeline bench-board bench-master pictures test lint clean libusb
+.PHONY: help demo real sweeps source-faults faults bench-pipeline bench-board bench-master pictures test lint clean libusb
 
 ARGS ?=
 EXTRAS := edge,master,realsense,sim,dev
@@ -34,6 +34,9 @@ sweeps: $(READY) ## how thin, how small, how silent: the filter before simulated
 
 source-faults: $(READY) libusb ## a RealSense camera that hangs, dies and is unplugged: how long until frames flow again
 	@$(BIN)/python -m benchmarks.source_faults $(ARGS)
+
+faults: $(READY) ## units, master, networks, clocks and disks that fail: what the map says meanwhile
+	@$(BIN)/python -m benchmarks.faults $(ARGS)
 
 bench-pipeline: $(BENCH_READY) libusb ## what a frame costs, beside Open3D, OctoMap and Embree on the same frames
 	@$(BIN)/python -m benchmarks.pipeline $(ARGS)

@@ -14,6 +14,13 @@ In the order of the flow:
     real_frames the real recordings, and what must come out of them
     real         a real master and a real unit on them, judged frame by frame
     source_faults what a RealSense source does when the camera makes trouble
+    fault_scene  what stands before the cameras of the fault table, and which blocks it fills
+    fault_unit   the edge unit before a camera whose picture may be exchanged
+    fault_clock  other clocks for one process
+    fault_network a cable that can be pulled, and a proxy that is slow, cuts and remembers
+    fault_watch  asks for the map all the time, and holds the answers against the truth
+    fault_site   a master, two units and a robot, and all that may be done to them
+    faults       what the map says while processes, clocks, networks and disks fail
     ur3_scene    a UR3 in a room, something unknown beside it: what the speed is measured on
     peers        the same work by Open3D, OctoMap and Embree
     pipeline     what a frame costs, in turns with them

@@ -8,7 +8,7 @@ import ctypes
 import os
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -106,8 +106,19 @@ class Processes:
     ) -> None:
         await self.stop(*self._children)
 
-    async def start(self, name: str, module: str, *arguments: str, may_end: bool = False) -> Child:
-        """Run `python -m module arguments` in a session of its own, so that a Ctrl-C reaches only this process."""
+    async def start(
+        self,
+        name: str,
+        module: str,
+        *arguments: str,
+        may_end: bool = False,
+        under: Sequence[str] = (),
+        variables: Mapping[str, str] | None = None,
+    ) -> Child:
+        """Run `python -m module arguments` in a session of its own, so that a Ctrl-C reaches only this process.
+
+        `under` is a command that runs another, as nsenter does; `variables` are added to the environment.
+        """
         log = self._folder / f"{name}.log"
         parent = os.getpid()
 
@@ -119,6 +130,7 @@ class Processes:
 
         with log.open("wb") as output:
             process = await asyncio.create_subprocess_exec(
+                *under,
                 sys.executable,
                 "-m",
                 module,
@@ -126,7 +138,7 @@ class Processes:
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
-                env=self._environment,
+                env={**self._environment, **(variables or {})},
                 start_new_session=True,
                 preexec_fn=in_child,
             )

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Networks that fail: namespaces of our own with a cable between them, and a proxy that is slow, cuts and remembers.
+
+All runs in namespaces without a name, which the kernel takes away with their last process, however that ends; the
+machine's own interfaces and mounts are never touched.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.errors import ConfigError
+
+MASTER_IP, UNIT_IP = "10.77.0.1", "10.77.0.2"
+"""At the two ends of the cable."""
+
+CHUNK_BYTES = 65536
+
+
+NAMESPACES = (("unshare", "--net", "--mount"), ("unshare", "--user", "--map-root-user", "--net", "--mount"))
+"""As root; as anyone, where the kernel lets them."""
+
+
+def allowed(unshare: Sequence[str]) -> bool:
+    """Whether this command can make its namespaces here."""
+    try:
+        return not subprocess.run((*unshare, "true"), capture_output=True, check=False).returncode
+    except FileNotFoundError:
+        return False
+
+
+def confine(module: str, arguments: Sequence[str]) -> None:
+    """Run `python -m module --inside arguments` in this process's place, with a network and mounts of its own.
+
+    Raises:
+        ConfigError: the kernel does not allow it.
+    """
+    for unshare in NAMESPACES:
+        if allowed(unshare):
+            os.execvp(unshare[0], (*unshare, sys.executable, "-m", module, "--inside", *arguments))
+    raise ConfigError("namespaces: expected to be root, or a kernel where anyone may make them (man 7 user_namespaces)")
+
+
+def run(*command: str) -> None:
+    """Run a command of the system.
+
+    Raises:
+        ConfigError: it failed, or is not installed.
+    """
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True)
+    except FileNotFoundError as error:
+        raise ConfigError(f"{command[0]}: expected to be installed (packages iproute2, util-linux)") from error
+    except subprocess.CalledProcessError as error:
+        raise ConfigError(f"{' '.join(command)}: {error.stderr.strip()}") from error
+
+
+class Cable:
+    """Another network namespace, and a cable from there to here."""
+
+    def __init__(self) -> None:
+        """Raises ConfigError when it cannot be laid."""
+        # `echo` tells that the namespace is there; `read` keeps it until we are gone.
+        self._holder = subprocess.Popen(
+            ("unshare", "--net", "sh", "-c", "echo; read line"), stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        assert self._holder.stdout is not None
+        self._holder.stdout.readline()
+        self.under = ("nsenter", f"--net=/proc/{self._holder.pid}/ns/net", "--")
+        run("ip", "link", "add", "cut0", "type", "veth", "peer", "name", "cut1", "netns", str(self._holder.pid))
+        run("ip", "address", "add", f"{MASTER_IP}/24", "dev", "cut0")
+        run(*self.under, "ip", "address", "add", f"{UNIT_IP}/24", "dev", "cut1")
+        run(*self.under, "ip", "link", "set", "cut1", "up")
+        self.plug()
+
+    def plug(self) -> None:
+        """Plug it in."""
+        run("ip", "link", "set", "cut0", "up")
+
+    def pull(self) -> None:
+        """Pull it out."""
+        run("ip", "link", "set", "cut0", "down")
+
+    def close(self) -> None:
+        """Take it away with its namespace."""
+        self._holder.communicate()
+
+
+@dataclass
+class Proxy:
+    """Passes TCP on from a port of its own to the master, as if from the unit's own address."""
+
+    master_port: int
+    unit_address: str
+    delay_s: float = 0.0
+    jitter_s: float = 0.0
+    """Of what the unit sends; what it is answered comes at once."""
+
+    sent: list[bytes] = field(default_factory=list)
+    """Whole requests of the unit, oldest first."""
+
+    url: str = field(init=False, default="")
+    _server: asyncio.Server = field(init=False)
+    _writers: set[asyncio.StreamWriter] = field(init=False, default_factory=set)
+    _tasks: set[asyncio.Task[None]] = field(init=False, default_factory=set)
+
+    async def open(self) -> None:
+        """Listen."""
+        self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
+        self.url = f"http://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
+
+    def cut(self) -> None:
+        """Reset all connections that there are; new ones are taken."""
+        for writer in list(self._writers):
+            writer.transport.abort()
+
+    async def close(self) -> None:
+        """Stop."""
+        self._server.close()
+        self.cut()
+        await asyncio.gather(*self._tasks)
+        await self._server.wait_closed()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._tasks.add(task)
+        ends = {writer}
+        waiting: asyncio.Queue[tuple[int, bytes]] = asyncio.Queue()
+        try:
+            answers, to_master = await asyncio.open_connection(
+                "127.0.0.1", self.master_port, local_addr=(self.unit_address, 0)
+            )
+            ends.add(to_master)
+            self._writers |= ends
+            ways = self._take(reader, waiting), self._pass_on(waiting, to_master), self._back(answers, writer)
+            tasks = [asyncio.create_task(way) for way in ways]
+            # One end is gone, and so is the other; whoever needs them connects anew.
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for way in tasks:
+                way.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        except OSError:
+            # The master is not there.
+            pass
+        finally:
+            self._tasks.discard(task)
+            self._writers -= ends
+            for end in ends:
+                end.transport.abort()
+
+    async def _take(self, reader: asyncio.StreamReader, waiting: asyncio.Queue[tuple[int, bytes]]) -> None:
+        """What the unit sends, each piece with the time at which it is due, and remembered request by request."""
+        begun = b""
+        while data := await reader.read(CHUNK_BYTES):
+            late_s = max(self.delay_s + random.uniform(-self.jitter_s, self.jitter_s), 0.0)
+            waiting.put_nowait((monotonic_ns() + round(late_s * NS_PER_S), data))
+            begun = self._remember(begun + data)
+
+    async def _pass_on(self, waiting: asyncio.Queue[tuple[int, bytes]], writer: asyncio.StreamWriter) -> None:
+        """To the master, in its order."""
+        while True:
+            due_ns, data = await waiting.get()
+            await asyncio.sleep(max(due_ns - monotonic_ns(), 0) / NS_PER_S)
+            writer.write(data)
+            await writer.drain()
+
+    async def _back(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while data := await reader.read(CHUNK_BYTES):
+            writer.write(data)
+            await writer.drain()
+
+    def _remember(self, data: bytes) -> bytes:
+        """Keep the requests that are whole; returns the rest."""
+        while b"\r\n\r\n" in data:
+            head, _, rest = data.partition(b"\r\n\r\n")
+            length = next(
+                (int(line[15:]) for line in head.split(b"\r\n") if line.lower().startswith(b"content-length:")), 0
+            )
+            if len(rest) < length:
+                break
+            self.sent.append(head + b"\r\n\r\n" + rest[:length])
+            data = rest[length:]
+        return data

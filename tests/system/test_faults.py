@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every fault of `make faults`, through the same code: nothing is called free that nobody sees, and nothing is lost."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from benchmarks.fault_network import NAMESPACES, allowed
+from benchmarks.fault_watch import NOTICED_S_MAX, RECOVERED_S_MAX
+from benchmarks.faults import FAULTS
+
+pytestmark = pytest.mark.slow
+
+NEED_STATE = {"master-killed", "camera-died-meanwhile", "master-disk-full", "token-revoked"}
+KEEPS_STATE = importlib.util.find_spec("master_server.store") is not None
+"""A master that keeps what it was told, and reads tokens anew."""
+
+BUSY_S = 1.0
+"""What other tests beside may add to a time; what is said of the map holds however busy the machine is."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def namespaces() -> None:
+    if not any(allowed(unshare) for unshare in NAMESPACES):
+        reason = "the kernel allows no namespaces here"
+        if os.environ.get("CI"):
+            pytest.fail(reason, pytrace=False)
+        pytest.skip(reason)
+
+
+def struck(name: str) -> dict[str, Any]:
+    """The row of one fault."""
+    command = (sys.executable, "-m", "benchmarks.faults", name)
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.stdout, run.stderr
+    (row,) = json.loads(run.stdout.splitlines()[-1])["faults"]
+    return dict(row)
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_nothing_is_called_free_that_nobody_sees(fault: Any) -> None:
+    if fault.name in NEED_STATE and not KEEPS_STATE:
+        pytest.skip("this master forgets what it was told when it ends")
+    row = struck(fault.name)
+    assert not row["false_free"], row
+    assert row["lost"] == 0, row
+    assert row["answers"] > 20
+    if fault.names is None:
+        assert row["noticed_s"] is None
+    else:
+        assert row["noticed_s"] is not None, row
+        assert row["noticed_s"] <= NOTICED_S_MAX + BUSY_S
+        assert fault.names in row["told"]
+    assert row["recovered_s"] is not None, row
+    assert row["recovered_s"] <= RECOVERED_S_MAX + BUSY_S

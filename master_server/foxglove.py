@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
 
 import numpy as np
@@ -49,6 +50,9 @@ ROBOT_COLOR = Color(r=0.25, g=0.45, b=0.8, a=0.6)
 BOX_COLOR = Color(r=0.9, g=0.9, b=0.9, a=0.8)
 UNSEEN_COLOR = Color(r=0.85, g=0.6, b=0.1, a=0.08)
 BOX_LINE_PX = 1.5
+
+LENGTH_DELIMITED = 2
+"""Protobuf's wire type of a message in a message."""
 
 
 def stamp_of(log_ns: int) -> Timestamp:
@@ -122,18 +126,11 @@ def unseen_scene(blocks: Lattice, seen_by: NDArray[np.uint8], stamp: Timestamp) 
     if len(first) > MAX_UNSEEN_BOXES:
         largest = np.argsort(-sizes.prod(axis=1), kind="stable")[:MAX_UNSEEN_BOXES]
         first, sizes = first[largest], sizes[largest]
-    edges_m = sizes * blocks.voxel_size_m
+    edges_m = sizes.astype(np.float64) * blocks.voxel_size_m
     middles_m = np.array(blocks.origin_m) + first * blocks.voxel_size_m + edges_m / 2.0
-    upright = Quaternion(w=1.0)
-    cubes = [
-        CubePrimitive(
-            pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=upright),
-            size=Vector3(x=a, y=b, z=c),
-            color=UNSEEN_COLOR,
-        )
-        for (x, y, z), (a, b, c) in zip(middles_m.tolist(), edges_m.tolist(), strict=True)
-    ]
-    return SceneUpdate(entities=[SceneEntity(timestamp=stamp, frame_id=WORLD, id="unseen", cubes=cubes)])
+    entity = SceneEntity(timestamp=stamp, frame_id=WORLD, id="unseen")
+    entity.MergeFromString(_cubes(middles_m, edges_m))
+    return SceneUpdate(entities=[entity])
 
 
 def boxes_of(chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -160,6 +157,24 @@ def stl_of(mesh: TriangleMesh) -> bytes:
     triangles["normal"] = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
     triangles["corners"] = corners
     return bytes(80) + len(triangles).to_bytes(4, "little") + triangles.tobytes()
+
+
+def _cubes(middles_m: NDArray[np.float64], edges_m: NDArray[np.float64]) -> bytes:
+    """The field `cubes` of a SceneEntity in protobuf's encoding, upright boxes with middles and edges (N, 3).
+
+    One is encoded by the library, and its six numbers replaced in all: thousands of objects would hold the
+    interpreter for 30 ms, and every update of a unit would wait.
+    """
+    marks = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0)
+    x, y, z, a, b, c = marks
+    pose = Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(w=1.0))
+    one = CubePrimitive(pose=pose, size=Vector3(x=a, y=b, z=c), color=UNSEEN_COLOR).SerializeToString()
+    encoded = bytes(((SceneEntity.CUBES_FIELD_NUMBER << 3) | LENGTH_DELIMITED, len(one))) + one
+    rows = np.tile(np.frombuffer(encoded, np.uint8), (len(middles_m), 1))
+    for mark, column in zip(marks, np.hstack((middles_m, edges_m)).T, strict=True):
+        place = encoded.index(struct.pack("<d", mark))
+        rows[:, place : place + 8] = column.astype("<f8")[:, None].view(np.uint8)
+    return rows.tobytes()
 
 
 def _joined(
@@ -229,6 +244,6 @@ def _corners(cell: Cell) -> Iterator[tuple[float, float, float]]:
 
 
 def _pose(transform: Transform) -> Pose:
-    w, x, y, z = quaternion_from_matrix(transform).tolist()
+    w, x, y, z = quaternion_from_matrix(transform, isprecise=True).tolist()
     px, py, pz = transform[:3, 3].tolist()
     return Pose(position=Vector3(x=px, y=py, z=pz), orientation=Quaternion(x=x, y=y, z=z, w=w))

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from pydantic import ValidationError
@@ -25,6 +26,7 @@ from master_server.recording_file import RecordingFile
 from master_server.recording_format import MapRecord, SeenRecord, StateRecord, moment_of
 from shared.clock import monotonic_ns
 from shared.errors import Refusal
+from shared.lattice import Lattice
 from shared.meshes import box_mesh
 from shared.messages import JointsRequest
 from tests.master_server.fakes import MS, START_NS, S, joined, master, sees_all
@@ -191,6 +193,23 @@ def test_boxes_cover_exactly_what_is_chosen(seed: int) -> None:
     for first, last in zip(*foxglove.boxes_of(chosen), strict=True):
         covered[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] += 1
     np.testing.assert_array_equal(covered, chosen)
+
+
+def test_unseen_boxes_stand_where_the_blocks_are() -> None:
+    seen_by = np.ones((4, 5, 6), np.uint8)
+    seen_by[1, 2, 3] = seen_by[2, 2, 3] = seen_by[0, 0, 0] = 0
+    blocks = Lattice((-1.0, 0.0, 0.5), 0.1, seen_by.shape)
+    drawn = foxglove.unseen_scene(blocks, seen_by, foxglove.stamp_of(0)).SerializeToString()
+    (entity,) = SceneUpdate.FromString(drawn).entities
+    found = [
+        (one.pose.position.x, one.pose.position.y, one.pose.position.z, one.size.x, one.size.y, one.size.z)
+        for one in entity.cubes
+    ]
+    np.testing.assert_allclose(sorted(found), [(-0.95, 0.05, 0.55, 0.1, 0.1, 0.1), (-0.8, 0.25, 0.85, 0.2, 0.1, 0.1)])
+    for cube in entity.cubes:
+        assert cube.pose.orientation.w == 1.0
+        assert 0.0 < cube.color.a < 0.5
+    assert not foxglove.unseen_scene(blocks, np.ones_like(seen_by), foxglove.stamp_of(0)).entities[0].cubes
 
 
 def test_boxes_are_few() -> None:

@@ -19,6 +19,7 @@ In the order of the flow:
     health          does what the camera sees still fit what it should see
     misfit          how badly a frame fits from where the camera should be, and from close by
     pipeline        the method, one line a stage
+    pictures        what a unit sees, as PNG
     rehearsal       every kernel, ready before the first frame
     board_layout    the calibration board on paper: what is printed where
     board_detection the board in one picture: which of its points are seen, and where

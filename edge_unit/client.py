@@ -15,6 +15,7 @@ import httpx
 from edge_unit.trust import tls_context
 from shared.errors import ConfigError, MasterRefused, MasterUnreachable, WireError
 from shared.messages import (
+    ImageKind,
     InitializeAnswer,
     InitializeRequest,
     PoseAnswer,
@@ -37,6 +38,9 @@ TRANSFER_TIMEOUT_S = 30.0
 
 MAX_MESH_BYTES = 128 * 2**20
 """Of one mesh; a robot link has a hundredth of it."""
+
+IMAGE_TIMEOUT_S = 5.0
+"""For a picture; whoever asked for it waits no longer."""
 
 LIMITS = httpx.Limits(max_connections=4, max_keepalive_connections=4, keepalive_expiry=60.0)
 """Update, joints, cell and pose may each be under way."""
@@ -127,6 +131,11 @@ class MasterClient:
         request = PoseRequest.model_validate({"T_world_camera": T_world_camera.tolist(), "origin": origin})
         data = await self._call("PUT", f"/units/{unit_id}/pose", encode(request))
         return decode(PoseAnswer, data).pose
+
+    async def put_image(self, unit_id: int, kind: ImageKind, command_id: int, png: bytes) -> None:
+        """Send a picture that a command asks for. Raises as `update`."""
+        path = f"/units/{unit_id}/images/{kind}?command={command_id}"
+        await self._call("PUT", path, png, {"Content-Type": "image/png"}, IMAGE_TIMEOUT_S)
 
     async def cell_document(self) -> dict[str, Any]:
         """The cell's document. Raises as `update`."""

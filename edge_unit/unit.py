@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge_unit.background import BackgroundStore, Place
 from edge_unit.camera_memory import CameraMemory
@@ -25,7 +26,8 @@ from edge_unit.cell_cache import CellCache
 from edge_unit.client import MasterClient
 from edge_unit.config import SourceConfig, UnitConfig
 from edge_unit.joints import JointEstimate
-from edge_unit.pipeline import DepthPipeline
+from edge_unit.pictures import picture_raw, png_of
+from edge_unit.pipeline import EXACT, DepthPipeline
 from edge_unit.reference import ReferenceLearner
 from edge_unit.rehearsal import rehearse
 from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
@@ -37,8 +39,8 @@ from edge_unit.stance import Stance, Verdict, place_of
 from edge_unit.trace import Trace, TraceRecord
 from edge_unit.uplink import Assignment, Report, Uplink
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.errors import InputError, SourceError
-from shared.messages import DONE, MAX_TEXT, MAX_VOXELS, Command, Health
+from shared.errors import CellwatchError, InputError, SourceError
+from shared.messages import DONE, MAX_TEXT, MAX_VOXELS, Command, Health, ImageKind
 from shared.settings import FilterSettings
 from shared.transforms import Transform
 from shared.wire import keys_to_bytes
@@ -63,6 +65,8 @@ CANNOT = {
     "refine": "this unit cannot refine its pose by the CAD",
 }
 """What is asked of units that they are not able to do, in words for the operator."""
+
+NO_POSE = "the pose of its camera is not known yet"
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
@@ -102,6 +106,7 @@ class Unit:
         self._learning: _Learning | None = None
         self._rehearsal: asyncio.Task[None] | None = None
         self._next_at_ns = 0
+        self._sending: set[asyncio.Task[None]] = set()
         self._trouble: str | None = "no frame yet"
         self.uplink = Uplink(
             self._client,
@@ -125,9 +130,10 @@ class Unit:
             try:
                 await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             finally:
-                for task in tasks:
+                for task in (*tasks, *self._sending):
                     task.cancel()
                 results = await asyncio.gather(*tasks, return_exceptions=True)
+                await asyncio.gather(*self._sending, return_exceptions=True)
                 await asyncio.to_thread(self._close)
             for result in results:
                 if isinstance(result, Exception):
@@ -220,9 +226,12 @@ class Unit:
             return
         if assignment.T_world_camera is None:
             self._pipeline = None
-            for command in self._take_commands():
-                self.uplink.finish(command, CANNOT.get(command.verb, "the pose of its camera is not known yet"))
+            commands = self._take_commands()
+            for command in commands:
+                if command.verb != "image":
+                    self.uplink.finish(command, CANNOT.get(command.verb, NO_POSE))
             self.uplink.offer(Report(assignment, frame.captured_at_ns, health=Health(frame=frame.frame_number)))
+            await self._show(commands, frame, None)
             return
         joints = await self._joints_at(assignment, frame)
         commands = self._take_commands()
@@ -231,6 +240,31 @@ class Unit:
             logger.info("%s", report.health.trouble or "frames are filtered and reported")
         self._trouble = report.health.trouble
         self.uplink.offer(report)
+        await self._show(commands, frame, joints)
+
+    async def _show(self, commands: list[Command], frame: DepthFrame, joints: JointEstimate | None) -> None:
+        """Draw the pictures that were asked for; they are encoded and sent while the next frame is taken."""
+        for command in commands:
+            if command.verb == "image" and command.image is not None:
+                try:
+                    picture = await asyncio.to_thread(self._picture, command.image, frame, joints)
+                except InputError as error:
+                    self.uplink.finish(command, str(error))
+                    continue
+                task = asyncio.create_task(self._send(command, picture))
+                self._sending.add(task)
+                task.add_done_callback(self._sending.discard)
+
+    async def _send(self, command: Command, picture: NDArray[np.uint16]) -> None:
+        assert self._camera is not None
+        scale_m = self._camera.intrinsics.depth_scale_m
+        try:
+            png = await asyncio.to_thread(png_of, picture, scale_m, command.raw)
+            await self.uplink.send_picture(command, png)
+        except CellwatchError as error:
+            self.uplink.finish(command, str(error))
+        else:
+            self.uplink.finish(command)
 
     async def _joints_at(self, assignment: Assignment, frame: DepthFrame) -> JointEstimate | None:
         """Where the robot was when the frame was taken; None when nobody knows."""
@@ -255,6 +289,15 @@ class Unit:
 
     # ------------------------------------------------------------------ in the thread
 
+    def _picture(self, kind: ImageKind, frame: DepthFrame, joints: JointEstimate | None) -> NDArray[np.uint16]:
+        """A picture of the frame that was processed last."""
+        if kind == "depth":
+            return frame.depth.copy()
+        if self._pipeline is None:
+            raise InputError(NO_POSE)
+        positions, uncertainty = (None, EXACT) if joints is None else (joints.positions, joints.uncertainty)
+        return picture_raw(kind, frame.depth, self._pipeline, positions, uncertainty)
+
     def _process(
         self,
         assignment: Assignment,
@@ -271,7 +314,8 @@ class Unit:
                 pipeline = self._prepared(assignment, T_world_camera)
             except InputError as error:
                 for command in commands:
-                    self.uplink.finish(command, str(error))
+                    if command.verb != "image":
+                        self.uplink.finish(command, str(error))
                 raise
             for command in commands:
                 self._obey(command, pipeline)
@@ -327,7 +371,7 @@ class Unit:
             pipeline.use(None)
             self._store.drop()
             self.uplink.finish(command)
-        else:
+        elif command.verb != "image":
             self.uplink.finish(command, CANNOT.get(command.verb, f"this unit does not know how to {command.verb}"))
 
     def _end_learning(self, outcome: str) -> None:

@@ -149,6 +149,11 @@ class Uplink:
         if command.id in self._open_commands:
             self._done.append(Outcome(command.id, outcome[:MAX_TEXT]))
 
+    async def send_picture(self, command: Command, png: bytes) -> None:
+        """Send the picture that a command asks for. Raises as `MasterClient.update`."""
+        assert command.image is not None
+        await self._client.put_image(self._id, command.image, command.id, png)
+
     async def drained(self, timeout_s: float) -> None:
         """Wait until nothing is left to be sent, but no longer than `timeout_s`."""
         if not await within(timeout_s, self._idle.wait()):

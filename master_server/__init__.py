@@ -13,6 +13,7 @@ In the order of the flow:
     coverage     what the units look through, united
     merge        the units' voxels, merged (Algorithm 9)
     registry     the units' slots and how far each can be trusted (Algorithm 8)
+    pictures     what units are asked to show
     master       all of that held together, without a network
     readable     what those ask of who only read: a master, or a recording of one
     answers      what readers are told of it

@@ -16,10 +16,11 @@ from master_server.cell_loading import CellLoader
 from master_server.limits import Limits
 from master_server.master import Master
 from master_server.metrics import Metrics
+from master_server.pictures import Pictures
 from master_server.readable import Readable
 from master_server.recording import Recorder
 from master_server.replay import Replay
-from master_server.routes import cell, health, map, recording, replay, robot, stream, units
+from master_server.routes import cell, health, images, map, recording, replay, robot, stream, units
 from master_server.routes.common import ip_of, log_refusal, refused
 from master_server.routes.replay import RefusedUpdate
 from master_server.routes.update import UpdateEndpoint
@@ -81,9 +82,10 @@ def make_app(
     master: Master, access: Access, recorder: Recorder | None = None, limits: Limits | None = None
 ) -> Application:
     """The application that serves one master; `limits` are shared with what holds its connections."""
-    routers = [module.router for module in (units, cell, map, stream, robot, recording, health)]
+    routers = [module.router for module in (units, images, cell, map, stream, robot, recording, health)]
     app = _assembled(Application, master, access, routers, recorder, limits)
     app.state.loader = CellLoader()
+    app.state.pictures = Pictures(master.registry)
     app.state.metrics = metrics = Metrics(master, app.state.stream)
     app.state.started_at_ns = monotonic_ns()
     app.take_updates(UpdateEndpoint(master, metrics))

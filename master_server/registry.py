@@ -6,7 +6,7 @@ from __future__ import annotations
 import logging
 import secrets
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -67,6 +67,7 @@ class _Asked:
 
     command: Command
     expires_at_ns: int
+    on_end: Callable[[Outcome], None] | None = None
 
 
 @dataclass
@@ -119,6 +120,8 @@ class Slot:
         """A command came to an end; harmless when it had before."""
         for asked in [asked for asked in self.asked if asked.command.id == outcome.id]:
             self.asked.remove(asked)
+            if asked.on_end is not None:
+                asked.on_end(outcome)
             verb = asked.command.verb
             level = logging.DEBUG if verb == "image" else logging.INFO
             fields = {**self.log_fields("command"), "verb": verb}
@@ -348,8 +351,16 @@ class Registry:
         slot = self.get(unit_id)
         del self._slots[unit_id], self._by_ip[slot.ip]
 
-    def ask(self, slot: Slot, verb: Verb, now_ns: int, image: ImageKind | None = None, raw: bool = False) -> Command:
-        """Have a unit do something; it learns of it with the answer to its next update.
+    def ask(
+        self,
+        slot: Slot,
+        verb: Verb,
+        now_ns: int,
+        image: ImageKind | None = None,
+        raw: bool = False,
+        on_end: Callable[[Outcome], None] | None = None,
+    ) -> Command:
+        """Have a unit do something; it learns of it with the answer to its next update. `on_end` is told the outcome.
 
         Raises:
             Refusal: 409, too many commands wait for it already.
@@ -360,7 +371,7 @@ class Registry:
         self._last_command += 1
         command = Command(id=self._last_command, verb=verb, image=image, raw=raw)
         expires_s = IMAGE_EXPIRES_S if verb == "image" else COMMAND_EXPIRES_S
-        slot.asked.append(_Asked(command, now_ns + round(expires_s * NS_PER_S)))
+        slot.asked.append(_Asked(command, now_ns + round(expires_s * NS_PER_S), on_end))
         if verb != "image":
             slot.last_command = CommandRow(id=command.id, verb=verb, outcome=None)
         return command

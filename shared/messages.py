@@ -46,6 +46,13 @@ MAX_JOINT_SAMPLES = 32
 """In one answer: a slow unit at 5 fps gets all that it needs at one sample in 8 ms."""
 
 
+PICTURE_RANGE_M = (0.3, 6.0)
+"""What the colours of all units' pictures span: from what is nearest to a camera to the far wall of its cell."""
+
+MAX_IMAGE_BYTES = 2**22
+"""Of one picture: 1280 x 720 in three colours has 2.8 MB even when nothing of it can be compressed."""
+
+
 def _printable(text: str) -> str:
     if not text.isprintable():
         raise ValueError("expected printable characters only, since it is written into logs")

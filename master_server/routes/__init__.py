@@ -6,6 +6,7 @@ In the order of the flow:
     common    bodies in bounds, JSON or msgpack, tokens
     update    `POST /update`, the path that every frame of every unit takes
     units     registering, and what is known of each unit
+    images    a unit's pictures, on request
     cell      the cell's document and meshes
     map       the merged map, the coverage and the settings
     stream    the merged map as it changes

@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import httpx
 import numpy as np
 import pytest
@@ -440,3 +441,32 @@ async def test_at_the_end_of_a_recording_the_last_frame_is_merged(tmp_path: Path
     assert 0 < last.merged_at_ns - last.captured_at_ns < 10**10
     assert len(last.keys) // 4 == len(bench.voxels())
     assert last.shape == (20, 40, 10)
+
+
+async def test_pictures_are_drawn_when_someone_asks(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path, T_world_camera=None)
+    transport = httpx.ASGITransport(app=lambda *call: bench.app(*call), client=(IP, 40_001))
+    headers = {"Authorization": f"Bearer {TOKEN}"}
+
+    async def picture(client: httpx.AsyncClient, path: str) -> httpx.Response:
+        asking = asyncio.ensure_future(client.get(f"/units/1/images/{path}"))
+        await bench.until(lambda: not bench.unit.uplink.commands.empty(), "asked")
+        bench.show(patch(1225))
+        return await asking
+
+    async with bench.running(), httpx.AsyncClient(transport=transport, base_url="http://m", headers=headers) as client:
+        await bench.until_state("uncalibrated")
+        raw = await picture(client, "depth?raw=1")
+        assert raw.status_code == 200, raw.text
+        assert (cv2.imdecode(np.frombuffer(raw.content, np.uint8), cv2.IMREAD_UNCHANGED) == patch(1225)).all()
+        refused = await picture(client, "expected")
+        assert (refused.status_code, "its camera is not known" in refused.text) == (409, True)
+        bench.master.set_pose(1, _matrix(ABOVE), "operator", None)
+        await bench.until(lambda: bench.unit.uplink.assignment.T_world_camera is not None, "the pose")
+        left = await picture(client, "foreground?raw=1")
+        found = cv2.imdecode(np.frombuffer(left.content, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert set(np.unique(found).tolist()) == {FAR_MM, 1225}
+        coloured = await picture(client, "expected")
+        assert cv2.imdecode(np.frombuffer(coloured.content, np.uint8), cv2.IMREAD_UNCHANGED).shape == (48, 64, 3)
+        await bench.until_state("live")
+        await bench.until(lambda: not bench.master.registry.get(1).asked, "all told")

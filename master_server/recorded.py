@@ -209,6 +209,8 @@ class Recording:
         if first is None or last is None:
             raise SourceError(f"{self.path}: there is no whole chunk in it: {self.trouble}")
         self._first = first[0]
+        # What this version cannot read is told now, not to whom asks first.
+        self._parsed(self._first)
         self.begin_ns, self.end_ns = first[0].log_ns, last[-1].log_ns
 
     def _attachment(self, name: str) -> bytes | None:

@@ -18,13 +18,14 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
+from master_server import recorded as recorded_module
 from master_server.__main__ import main
 from master_server.access import Access
 from master_server.app import make_app, make_replay_app
 from master_server.master import Master
 from master_server.recorded import Recording, duration_s
 from master_server.recording_file import RecordingFile
-from master_server.recording_format import moment_of
+from master_server.recording_format import StateRecord, moment_of
 from master_server.replay import Replay, ReplayRequest
 from master_server.routes import map, replay, robot, units
 from shared.cell import Cell, PlacedMesh
@@ -244,7 +245,7 @@ import os, signal, sys
 from pathlib import Path
 from tests.master_server.test_replay import WALL_LESS_MONOTONIC_NS, Script
 from master_server.recording_file import RecordingFile
-from master_server.recording_format import moment_of
+from master_server.recording_format import StateRecord, moment_of
 script = Script()
 file = RecordingFile(Path(sys.argv[1]), WALL_LESS_MONOTONIC_NS)
 for number in range(36):
@@ -327,6 +328,20 @@ def test_what_is_no_recording_is_named(tmp_path: Path, capsys: pytest.CaptureFix
             assert line.startswith(f"master-server: {tmp_path / name}: ")
             assert words in line
             assert line.count("\n") == 1
+
+
+class Later(StateRecord):
+    """As a later version might have it."""
+
+    temperature_c: float
+
+
+def test_a_recording_of_another_version_is_told_when_it_is_opened(
+    recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorded_module, "StateRecord", Later)
+    with pytest.raises(SourceError, match=r"Later: temperature_c: field required"):
+        Recording(recorded)
 
 
 def test_info_tells_what_is_in_it(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import http.server
+import json
 import socket
 import ssl
 import subprocess
@@ -17,6 +18,7 @@ import httpx
 import pytest
 import trustme
 import yaml
+from websockets.sync.client import connect
 
 from tests.system.cluster import Cluster, until, write_cell, write_recording
 
@@ -46,6 +48,14 @@ def test_units_reach_their_master_over_tls(cluster: Cluster) -> None:
     cluster.start_unit(1, source, T_world_camera=pose, master_ca=str(cluster.folder / "ca.pem"))
     cluster.start_unit(2, {**source, "serial": "B"}, T_world_camera=pose, master_fingerprint=fingerprint(cluster))
     cluster.until_live(2)
+
+
+def test_readers_of_the_stream_hear_it_over_tls(cluster: Cluster) -> None:
+    url = cluster.url.replace("http", "ws") + "/stream?encoding=json"
+    headers = {"Authorization": cluster.operator.headers["Authorization"]}
+    context = ssl.create_default_context(cafile=cluster.folder / "ca.pem")
+    with connect(url, additional_headers=headers, ssl=context, proxy=None) as reader:
+        assert [json.loads(reader.recv(timeout=5.0))["number"] for _ in range(3)] == [1, 2, 3]
 
 
 def test_doctor_speaks_tls(cluster: Cluster) -> None:

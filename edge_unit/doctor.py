@@ -192,7 +192,7 @@ async def _master(config: UnitConfig) -> AsyncIterator[Finding | Cell]:
             yield Finding("FAIL", "token", f"{error}; copy the master's unit.token to this board")
             return
         except CellwatchError as error:
-            yield Finding("FAIL", "master", f"{error}; is it running, and are master_url and certificate right?")
+            yield Finding("FAIL", "master", f"{error}; is it running, and is master_url right?")
             return
         if trip_ms <= ROUND_TRIP_OK_MS:
             yield Finding("ok", "master", f"{client.url} answers within {trip_ms:.1f} ms")

@@ -27,6 +27,7 @@ In the order of the flow:
     replay       a recording that answers as the master did
     config       the master's own configuration
     routes/      the same as HTTP
+    description  the API described, with examples for the cell that is watched
     app          the web application, assembled
     websocket    a socket that keeps nothing for who does not read
     connections  sockets held within bounds: how many, how slow, TLS

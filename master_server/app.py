@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from typing import Any
 
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
@@ -13,11 +14,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from master_server.access import Access
 from master_server.cell_loading import CellLoader
+from master_server.description import describe, illustrate, serve_documentation
 from master_server.limits import Limits
 from master_server.master import Master
-from master_server.metrics import Metrics
+from master_server.metrics import VERSION, Metrics
 from master_server.pictures import Pictures
-from master_server.readable import Readable
+from master_server.readable import Readable, ReadableCell
 from master_server.recording import Recorder
 from master_server.replay import Replay
 from master_server.routes import cell, health, images, map, recording, replay, robot, stream, units
@@ -40,11 +42,22 @@ class Application(FastAPI):
     """FastAPI, but for the one path that takes an update: it is spared the way through it."""
 
     update: ASGIApp
+    _described_for: ReadableCell | None = None
 
     def take_updates(self, update: ASGIApp) -> None:
         """From now on `update` answers `POST /update`."""
         self.update = update
         self.router.routes.append(Route("/update", update, methods=["POST"]))
+
+    def openapi(self) -> dict[str, Any]:
+        """The API described, with examples for the cell as it is now."""
+        master: Readable = self.state.master
+        if self.openapi_schema is None:
+            self.openapi_schema = describe(self, isinstance(self, ReplayApplication))
+        if self._described_for is not master.published:
+            illustrate(self.openapi_schema, master)
+            self._described_for = master.published
+        return self.openapi_schema
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
@@ -112,6 +125,8 @@ def _assembled(
 
     @asynccontextmanager
     async def running(app: FastAPI) -> AsyncIterator[None]:
+        # Now, while nobody waits for it.
+        app.openapi()
         listeners.start()
         if recorder is not None and recorder.enabled:
             await recorder.begin()
@@ -124,7 +139,9 @@ def _assembled(
 
     app = kind(
         title="Cellwatch master",
-        description=(master.__doc__ or "").splitlines()[0],
+        version=VERSION,
+        docs_url=None,
+        redoc_url=None,
         exception_handlers={
             Refusal: _refused,
             InputError: _refused,
@@ -141,6 +158,7 @@ def _assembled(
     app.state.recorder = recorder
     for router in routers:
         app.include_router(router)
+    serve_documentation(app)
     return app
 
 

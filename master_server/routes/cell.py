@@ -86,7 +86,12 @@ async def move_object(name: ObjectName, body: ObjectPoseRequest, master: MasterD
     return master.move_object(name, body.T_world_object)
 
 
-@router.get("/cell/meshes/{sha256}", dependencies=READERS, response_class=Response)
+@router.get(
+    "/cell/meshes/{sha256}",
+    dependencies=READERS,
+    response_class=Response,
+    responses={200: {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}},
+)
 async def mesh(sha256: Sha256, master: ReadableDependency) -> Response:
     """A mesh in its canonical bytes; it never changes, so keep it for ever."""
     data = master.published.meshes.get(sha256)

@@ -39,7 +39,12 @@ async def healthz(request: Request, master: MasterDependency) -> HealthAnswer:
     )
 
 
-@router.get("/metrics", dependencies=READERS, response_class=Response)
+@router.get(
+    "/metrics",
+    dependencies=READERS,
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
+)
 async def metrics(request: Request) -> Response:
     """All series of the master, as Prometheus text."""
     found = request.app.state.metrics

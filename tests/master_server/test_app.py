@@ -92,7 +92,8 @@ async def test_from_initialize_to_voxels(desk: Desk) -> None:
     assert found["witnesses"] == [1, 1, 1]
     assert found["lattice"] == {"origin_m": [0.0, 0.0, 0.0], "voxel_size_m": 0.05, "shape": [20, 40, 10]}
     assert (found["complete"], found["reasons"], found["units_live"]) == (True, [], 1)
-    assert 0.03 <= found["oldest_view_age_s"] < 1.0
+    # The offset of the clocks is known to half a round trip only.
+    assert 0.02 <= found["oldest_view_age_s"] < 1.0
 
 
 async def test_voxels_in_every_form(desk: Desk) -> None:

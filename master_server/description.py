@@ -65,6 +65,7 @@ REASONS = {
     422: "A field is missing, unknown, of another type or out of range; it is named.",
     429: "Too many requests, or too many wrong tokens, of this address; `Retry-After` says when to come again.",
     503: "The master has no place left.",
+    504: "The unit did not answer in time.",
     507: "The disk is full.",
 }
 
@@ -78,7 +79,8 @@ SPECIFIC: dict[tuple[str, str], frozenset[int]] = {
     ("get", "/recording"): frozenset({409}),
     ("post", "/recording"): frozenset({409, 507}),
     ("delete", "/recording"): frozenset({409, 507}),
-    ("get", "/units/{unit_id}/images/{kind}"): frozenset({404, 409, 503}),
+    ("get", "/units/{unit_id}/images/{kind}"): frozenset({409, 504}),
+    ("put", "/units/{unit_id}/images/{kind}"): frozenset({409}),
 }
 """Beyond what follows from a route's token, parameters and body."""
 
@@ -154,6 +156,8 @@ class Examples:
             "unseen": lambda: True,
             "blocks": lambda: True,
             "since_ns": lambda: 0,
+            "raw": lambda: True,
+            "command": lambda: 1,
         }
         return known[name]() if name in known else None
 

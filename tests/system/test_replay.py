@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from websockets.asyncio.client import connect
 
-from tests.system.cluster import STOP_S, Cluster, stop, until, write_cell, write_recording
+from tests.system.cluster import START_S, STOP_S, Cluster, stop, until, write_cell, write_recording
 
 LOOKING_ALONG_Y = {"xyz": [1.0, -1.0, 1.0], "rpy_deg": [-90.0, 0.0, 0.0]}
 SECONDS = 5.0
@@ -58,7 +58,7 @@ def test_what_was_recorded_is_served_again(cluster: Cluster, number: signal.Sign
     master = cluster.start_master("--record", str(folder))
     source = {"kind": "recorded", "folder": str(write_recording(cluster.folder / "images")), "fps": 15.0, "loop": True}
     cluster.start_unit(1, source, T_world_camera=LOOKING_ALONG_Y)
-    cluster.until_live(1)
+    cluster.until_live(1, 2 * START_S)
     until(lambda: len(cluster.get("/voxels")["voxels"]) >= 80, "the patch")
     seen_live = cluster.get("/recording")["moments"]
     until(lambda: cluster.get("/recording")["moments"] >= seen_live + SECONDS * 10, "five seconds", 3 * SECONDS)

@@ -18,6 +18,7 @@ In the order of the flow:
     visibility      which blocks of the cell a frame looks through
     health          does what the camera sees still fit what it should see
     misfit          how badly a frame fits from where the camera should be, and from close by
+    refine          the camera's pose, refined by what it measures of the CAD
     pipeline        the method, one line a stage
     pictures        what a unit sees, as PNG
     rehearsal       every kernel, ready before the first frame

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -17,6 +17,7 @@ from edge_unit.kernels import foreground, limits
 from edge_unit.links import Links
 from edge_unit.misfit import Misfit, MisfitCheck
 from edge_unit.reference import Reference, ReferenceLearner
+from edge_unit.refine import Refinement, Refiner, median_depth_m
 from edge_unit.visibility import SeenBlocks, Visibility
 from edge_unit.voxels import Voxelizer, Voxels
 from shared.camera import Intrinsics
@@ -218,6 +219,29 @@ class DepthPipeline:
         self.reference = reference
         self._renew_static()
 
+    # ------------------------------------------------------------------ refining the pose
+
+    def without_robot(self, depth: NDArray[np.uint16], joints: ArrayLike | None) -> NDArray[np.uint16]:
+        """A copy of a frame (H, W) in which nothing is measured where the padded robot may stand; errors as `process`.
+
+        Without joints the robot stays in the picture: it may be anywhere.
+        """
+        bare = self.intrinsics.check_depth(depth).copy()
+        self._place_robot(joints, EXACT)
+        bare[self._robot.near_raw < limits.RAW_MAX] = 0
+        return bare
+
+    def refine(self, frames: Sequence[NDArray[np.uint16]]) -> Refinement:
+        """Find a better pose by the CAD that `frames` of `without_robot` show; `move` makes it count.
+
+        Raises:
+            InputError: there was no frame, or one has the wrong type or shape.
+        """
+        if not frames:
+            raise InputError("refine: expected at least one frame")
+        depth_m = median_depth_m([self.intrinsics.check_depth(each) for each in frames], self.intrinsics.depth_scale_m)
+        return Refiner(self.intrinsics, self.T_world_camera, self._cad_depth_m(), self._noise_per_m).refine(depth_m)
+
     # ------------------------------------------------------------------ what may change while it runs
 
     @property
@@ -351,7 +375,7 @@ class DepthPipeline:
     def _renew_static(self) -> None:
         """Limits of all that stands still: CAD and what was learned, less margins, nearest over the blur of an edge."""
         settings, camera = self.settings, self.intrinsics
-        w = np.maximum(self._static.nearest_w, self._objects.nearest_w)
+        w = self._cad_w()
         learned = self.reference
         reference_m = learned.depth_m if learned else self._unlearned
         spread_m = learned.spread_m if learned else self._unlearned
@@ -375,9 +399,7 @@ class DepthPipeline:
         np.subtract(np.maximum(self._limit_raw, self._minimum_raw), self._minimum_raw, out=self._room_raw)
         self._halo.renew(w, settings.static_padding_m, settings.margin_base_m, cad_noise_per_m)
         self._halo.lower(self._limit_raw, self._seen_limit_raw)
-        cad_m = np.full(camera.shape, np.inf, np.float32)
-        np.divide(1.0, w, out=cad_m, where=w > 0.0)
-        self._static_depth_m = np.fmin(cad_m, reference_m)
+        self._static_depth_m = np.fmin(self._cad_depth_m(), reference_m)
         static_raw = np.nan_to_num(self._static_depth_m / camera.depth_scale_m, nan=0.0, posinf=0.0)
         self._static_raw = np.where(static_raw < limits.RAW_MAX, static_raw, 0.0).astype(np.uint16)
         self.static_version += 1
@@ -394,6 +416,17 @@ class DepthPipeline:
             settings.seen_block_size_m,
             self.intrinsics.disparity_noise_m(settings.stereo_subpixel_px),
         )
+
+    def _cad_w(self) -> NDArray[np.float32]:
+        """Inverse depth (H, W) of CAD and known objects in 1/m, 0 where there are none."""
+        return np.asarray(np.maximum(self._static.nearest_w, self._objects.nearest_w))
+
+    def _cad_depth_m(self) -> NDArray[np.float32]:
+        """Depth (H, W) of CAD and known objects in metres, inf where there are none."""
+        w = self._cad_w()
+        depth_m = np.full(w.shape, np.inf, np.float32)
+        np.divide(1.0, w, out=depth_m, where=w > 0.0)
+        return depth_m
 
     def _check_uncertainty(self, joint_uncertainty_rad: ArrayLike) -> NDArray[np.float64] | None:
         """The uncertainty (n,) of each joint; None when there is none."""

@@ -19,5 +19,6 @@ In the order of the flow:
     density     voxels with too few points are noise (Algorithms 6 and 7)
     seen        which blocks of the cell a frame looks through
     agreement   how well measured depth fits expected depth
+    align       how far measured points lie from the planes that they should lie on
     misfit      how badly, from where the camera should be and from places close by
 """

@@ -40,7 +40,7 @@ from edge_unit.trace import Trace, TraceRecord
 from edge_unit.uplink import Assignment, Report, Uplink
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.errors import CellwatchError, InputError, SourceError
-from shared.messages import DONE, MAX_TEXT, MAX_VOXELS, Command, Health, ImageKind
+from shared.messages import DONE, MAX_TEXT, MAX_VOXELS, Command, Health, ImageKind, ToldOrigin
 from shared.settings import FilterSettings
 from shared.transforms import Transform
 from shared.wire import keys_to_bytes
@@ -95,7 +95,9 @@ class Unit:
             config.master_url, config.read_token, config.source_address, tls=config.tls()
         )
         configured = config.T_world_camera
-        self._pose = None if configured is None else (configured.transform(), "configured")
+        self._pose: tuple[Transform, ToldOrigin] | None = (
+            None if configured is None else (configured.transform(), "configured")
+        )
         self._store = BackgroundStore(config.state_dir)
         self._memory = CameraMemory(config.state_dir)
         self._stance = Stance(config.state_dir)

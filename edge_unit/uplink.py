@@ -32,9 +32,11 @@ from shared.messages import (
     InitializeRequest,
     Outcome,
     SeenReport,
+    ToldOrigin,
     UpdateAnswer,
     UpdateRequest,
     Versions,
+    matrix_of,
 )
 from shared.settings import Settings
 from shared.timebase import ClockOffset, Exchange
@@ -99,7 +101,7 @@ class Uplink:
         self._boot_id = boot_id
         self._on_sent = on_sent
         self._camera: CameraInfo | None = None
-        self._known_pose: tuple[Transform, str] | None = None
+        self._known_pose: tuple[Transform, ToldOrigin] | None = None
         self._fresh: Report | None = None
         self._last: Report | None = None
         self._wake = asyncio.Event()
@@ -122,10 +124,10 @@ class Uplink:
 
     # ------------------------------------------------------------------ what the unit calls
 
-    def set_camera(self, camera: CameraInfo, known_pose: tuple[Transform, str] | None) -> None:
+    def set_camera(self, camera: CameraInfo, known_pose: tuple[Transform, ToldOrigin] | None) -> None:
         """This is the camera to register with; another one than before means registering again.
 
-        `known_pose` (`T_world_camera` and where it is from) is told to a master that knows none.
+        `known_pose` (`T_world_camera` and where it is from) is told to the master, which may know better.
         """
         if self._camera is not None and (self._camera.serial, self._camera.intrinsics) != (
             camera.serial,
@@ -197,6 +199,7 @@ class Uplink:
             await self._wake.wait()
         camera = self._camera
         await self._client.authorize()
+        told, origin = self._known_pose or (None, "configured")
         sent_at_ns = monotonic_ns()
         answer = await self._client.initialize(
             InitializeRequest(
@@ -206,6 +209,8 @@ class Uplink:
                 intrinsics=camera.intrinsics,
                 software=self._software,
                 boot_id=self._boot_id,
+                T_world_camera=None if told is None else matrix_of(told),
+                pose_origin=origin,
                 sent_at_ns=sent_at_ns,
             )
         )
@@ -224,12 +229,7 @@ class Uplink:
             self.commands.get_nowait()
         cell = await self._cells.get(answer.cell, self._client)
         pose = None if answer.T_world_camera is None else validated(answer.T_world_camera, "T_world_camera")
-        versions = answer.versions
-        if pose is None and self._known_pose is not None:
-            pose, origin = self._known_pose
-            version = await self._client.put_pose(answer.id, pose, origin)
-            versions = versions.model_copy(update={"pose": version})
-        self._assign(Assignment(answer.session, versions, answer.settings, answer.lattice.lattice(), cell, pose))
+        self._assign(Assignment(answer.session, answer.versions, answer.settings, answer.lattice.lattice(), cell, pose))
         logger.info("registered at %s as unit %d", self._client.url, answer.id)
 
     async def _report(self, assignment: Assignment) -> None:

@@ -9,6 +9,8 @@ In the order of the flow:
     published    the cell as it is given to units and operators
     unpacking    a cell's folder as a zip becomes a document and its meshes
     cell_loading a new cell is read while units go on
+    store        what must outlive the master, in one SQLite file
+    beginning    what a master begins with: its configuration or what was stored
     robot        the robot's joints, as a short history
     coverage     what the units look through, united
     merge        the units' voxels, merged (Algorithm 9)

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import gc
 import json
 import logging
@@ -31,6 +32,7 @@ from master_server.master import Master
 from master_server.recorded import Progress, Recording, summary
 from master_server.recording import Recorder
 from master_server.replay import Replay
+from master_server.store import FILE_NAME, Store
 from master_server.websocket import SERVER_OPTIONS
 from shared.cell import Cell
 from shared.configuration import assignments, load
@@ -115,9 +117,11 @@ class _Server(uvicorn.Server):
 def _serve_master(options: argparse.Namespace) -> None:
     config = _config(options)
     configure(config.log_level, config.log_format)
-    master = Master(Cell.load(config.cell), config.settings)
-    recorder = Recorder(master, config.recording, config.state_dir / "recordings")
-    _serve(config, lambda access, limits: make_app(master, access, recorder, limits))
+    cell = Cell.load(config.cell)
+    with contextlib.closing(Store.open(config.state_dir / FILE_NAME)) as store:
+        master = Master(cell, config.settings, store)
+        recorder = Recorder(master, config.recording, config.state_dir / "recordings")
+        _serve(config, lambda access, limits: make_app(master, access, recorder, limits))
 
 
 def _serve_replay(options: argparse.Namespace) -> None:
@@ -261,7 +265,9 @@ def _info_parser() -> argparse.ArgumentParser:
 def _add_server_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", help="address to listen at (default: all)")
     parser.add_argument("--port", type=int, help="port to listen at, 0 for a free one (default: 8420)")
-    parser.add_argument("--state-dir", type=Path, metavar="DIR", help="where tokens are kept")
+    parser.add_argument(
+        "--state-dir", type=Path, metavar="DIR", help="where tokens are kept, and what outlives the master"
+    )
     parser.add_argument("--tls-certificate", type=Path, metavar="PEM", help="speak TLS with this certificate ...")
     parser.add_argument("--tls-key", type=Path, metavar="PEM", help="... and its key")
     parser.add_argument("--ready-file", type=Path, metavar="FILE", help="written as JSON when the master can be asked")

@@ -35,7 +35,9 @@ class ServerConfig(BaseModel):
     port: int = Field(default=DEFAULT_PORT, ge=0, le=65535, description="0 takes a free one.")
     tls_certificate: Path | None = Field(default=None, description="PEM; with it and its key the master speaks TLS.")
     tls_key: Path | None = Field(default=None, description="Of the certificate, in PEM, without a password.")
-    state_dir: Path = Field(default_factory=default_state_dir, description="Where tokens are kept.")
+    state_dir: Path = Field(
+        default_factory=default_state_dir, description="Where tokens and all that outlives the master are kept."
+    )
     public_reads: bool = Field(default=False, description="Whether reading needs no token.")
     log_level: LogLevel = Field(default="INFO", description="The least that is logged.")
     log_format: LogFormat = Field(default="text", description="Lines for people, or JSON for a collector.")

@@ -15,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from master_server.beginning import beginning
 from master_server.coverage import Coverage, blocks_of
 from master_server.merge import NO_KEYS, MergedMap
 from master_server.published import PublishedCell
 from master_server.registry import Registry, Slot
 from master_server.robot import RobotJoints
+from master_server.store import Store
 from shared.cell import Cell
 from shared.configuration import sentence
 from shared.errors import Refusal
@@ -33,6 +35,7 @@ from shared.messages import (
     JointsRequest,
     LatticeDescription,
     Matrix,
+    PoseOrigin,
     RobotAnswer,
     State,
     UnitRow,
@@ -70,16 +73,32 @@ class MapView:
 class Master:
     """What the master knows, and what may be asked of it."""
 
-    def __init__(self, cell: Cell, settings: Settings) -> None:
-        """Raises InputError when the cell needs too many voxels of the size in `settings`."""
-        self.published = PublishedCell.of(cell)
-        self.settings = settings
-        self.versions = Versions(settings=1, lattice=1, cell=1)
-        self.registry = Registry()
+    def __init__(self, cell: Cell, settings: Settings, store: Store | None = None) -> None:
+        """Begins where the master before it ended, by its `store`; with none, nothing outlives it.
+
+        Where `cell` and `settings`, as configured, are others than were stored, `beginning` decides.
+
+        Raises:
+            InputError: the cell needs too many voxels of the size in the settings.
+            ConfigError: the store is damaged.
+            CellError: a mesh is absurdly large and does not touch the box.
+            Refusal: 507, what it begins with cannot be stored.
+        """
+        self.store = Store.in_memory() if store is None else store
+        saved = self.store.load()
+        begun = beginning(saved, cell, settings)
+        self.published = PublishedCell.of(begun.cell)
+        lattice = begun.cell.lattice(begun.settings.voxel_size_m)
+        if begun.is_news:
+            self.store.begin(begun.cell, begun.cell_file, begun.settings, begun.configured, begun.versions)
+        cell = begun.cell
+        self.settings = settings = begun.settings
+        self.versions = begun.versions
+        self.registry = Registry(self.store, saved.units, saved.last_id)
         self.robot = RobotJoints(cell.robot.joint_names if cell.robot else None)
         self.listeners: list[Callable[[], None]] = []
         """Called after each change of what `view` says; time alone changes it too, see `next_change_ns`."""
-        self._begin_on(cell.lattice(settings.voxel_size_m), blocks_of(cell, settings.seen_block_size_m))
+        self._begin_on(lattice, blocks_of(cell, settings.seen_block_size_m))
 
     @property
     def cell(self) -> Cell:
@@ -92,7 +111,8 @@ class Master:
         """A unit asks for its slot (Algorithm 8).
 
         Raises:
-            Refusal: it speaks another contract, its camera reports from elsewhere, or there are too many units.
+            Refusal: it speaks another contract, its camera reports from elsewhere, another camera reports from
+                its IP, there are too many units, or it cannot be stored.
         """
         if request.contract != CONTRACT_VERSION:
             raise Refusal(400, f"contract: this master speaks version {CONTRACT_VERSION}, the unit {request.contract}")
@@ -171,21 +191,21 @@ class Master:
         """Delete a unit. If it still runs it comes back, as a new one.
 
         Raises:
-            Refusal: 404, there is none.
+            Refusal: 404, there is none; 507, it cannot be stored.
         """
         self.registry.remove(unit_id)
         self._withdraw(unit_id)
         self._changed()
 
-    def set_pose(self, unit_id: int, T_world_camera: Matrix, origin: str, ip: str | None) -> int:
+    def set_pose(self, unit_id: int, T_world_camera: Matrix, origin: PoseOrigin, ip: str | None) -> int:
         """A camera's pose is known, by whatever means; returns its version. `ip` is the caller's, if it is a unit.
 
         Raises:
-            Refusal: 404, there is no such unit; 403, it is another's.
+            Refusal: 404, there is no such unit; 403, it is another's; 507, it cannot be stored.
             InputError: the pose is no rigid transform.
         """
         slot = self.registry.get(unit_id) if ip is None else self.registry.own(unit_id, ip)
-        slot.set_pose(matrix_of(validated(T_world_camera, "T_world_camera")))
+        self.registry.set_pose(slot, matrix_of(validated(T_world_camera, "T_world_camera")), origin)
         self._withdraw(slot.id)
         self._changed()
         logger.info("unit %d (%s): its pose is set (%s)", slot.id, slot.ip, origin, extra=slot.log_fields("pose"))
@@ -275,7 +295,7 @@ class Master:
         """Change some settings; the others stay. Every unit has them with the answer to its next update.
 
         Raises:
-            Refusal: 422, a name is unknown or a value out of range.
+            Refusal: 422, a name is unknown or a value out of range; 507, it cannot be stored.
             InputError: the cell would need too many voxels of that size; nothing was changed.
         """
         try:
@@ -287,12 +307,13 @@ class Master:
         lattice = self.cell.lattice(settings.voxel_size_m)
         blocks = blocks_of(self.cell, settings.seen_block_size_m)
         lattice_changes = lattice != self.lattice
-        self.settings = settings
-        self.versions = Versions(
+        versions = Versions(
             settings=self.versions.settings + 1,
             lattice=self.versions.lattice + lattice_changes,
             cell=self.versions.cell,
         )
+        self.store.save_settings(settings, versions)
+        self.settings, self.versions = settings, versions
         if lattice_changes or blocks != self.coverage.blocks:
             self._begin_on(lattice, blocks)
         self._changed()
@@ -307,22 +328,24 @@ class Master:
         Raises:
             InputError: the cell would need too many voxels; the old one stays.
             CellError: a mesh is absurdly large and does not touch the box; the old one stays.
+            Refusal: 507, it cannot be stored; the old one stays.
         """
         published = cell if isinstance(cell, PublishedCell) else PublishedCell.of(cell)
         lattice = published.cell.lattice(self.settings.voxel_size_m)
         blocks = blocks_of(published.cell, self.settings.seen_block_size_m)
         if published.reference == self.published.reference:
             return self.cell_answer
-        if published.document["robot"] != self.published.document["robot"]:
-            robot = published.cell.robot
-            self.robot = RobotJoints(robot.joint_names if robot else None)
-        self.published = published
-        self.versions = self.versions.model_copy(
+        versions = self.versions.model_copy(
             update={
                 "cell": self.versions.cell + 1,
                 "lattice": self.versions.lattice + (lattice != self.lattice),
             }
         )
+        self.store.save_cell(published.document, published.meshes, versions)
+        if published.document["robot"] != self.published.document["robot"]:
+            robot = published.cell.robot
+            self.robot = RobotJoints(robot.joint_names if robot else None)
+        self.published, self.versions = published, versions
         # Whatever was reported was made with the old cell.
         self._begin_on(lattice, blocks)
         logger.info("cell %s: version %d, %s", published.cell.name, self.versions.cell, published.reference.sha256[:8])
@@ -333,7 +356,7 @@ class Master:
         """A known object stands elsewhere from now on; otherwise as `change_cell`.
 
         Raises:
-            Refusal: 404, no object has this name.
+            Refusal: 404, no object has this name; 507, it cannot be stored.
             InputError: the pose is no rigid transform.
         """
         names = [body.name for body in self.cell.objects]

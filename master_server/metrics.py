@@ -85,7 +85,7 @@ class Metrics(Collector):
         for slot in self._master.registry:
             unit = (str(slot.id), slot.ip)
             state, _ = self._master.judge(slot, now_ns)
-            info.add_metric((*unit, slot.serial, slot.model, slot.software), 1.0)
+            info.add_metric((*unit, slot.serial, slot.record.model, slot.record.software), 1.0)
             for one in get_args(State):
                 states.add_metric((*unit, one), float(one == state))
             for family, value in ((age, slot.age_s(now_ns)), (arrival_age, slot.arrival_age_s(now_ns))):

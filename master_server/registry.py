@@ -4,15 +4,17 @@
 from __future__ import annotations
 
 import logging
+import math
 import secrets
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from master_server.merge import MAX_WITNESSES, NO_KEYS
+from master_server.store import Store, UnitRecord
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.errors import Refusal
 from shared.messages import (
@@ -24,6 +26,7 @@ from shared.messages import (
     InitializeRequest,
     Matrix,
     Outcome,
+    PoseOrigin,
     State,
     UnitRow,
     Verb,
@@ -31,6 +34,7 @@ from shared.messages import (
 )
 from shared.settings import Settings
 from shared.timebase import ClockOffset
+from shared.transforms import angle_rad, inverse
 
 logger = logging.getLogger(__name__)
 
@@ -57,6 +61,9 @@ MOVED_STATIC_SHARE = 0.1
 COMMAND_EXPIRES_S = 600.0
 """Learning the background at one frame a second takes minutes; what is not answered after ten of them never will be."""
 
+TOLD_ORIGINS = ("configured", "source")
+"""Of poses that the unit itself was told: it may tell another one later. What was measured or set here stays."""
+
 IMAGE_EXPIRES_S = 5.0
 """The unit needs one frame and one update for it; whoever waits in front of a browser has lost patience by then."""
 
@@ -74,13 +81,9 @@ class _Asked:
 class Slot:
     """What the master knows of the one camera behind an IP. Times of the unit are by the unit's clock."""
 
-    id: int
-    ip: str
-    serial: str = ""
-    model: str = ""
-    software: str = ""
-    boot_id: str = ""
-    session: int = 0
+    record: UnitRecord
+    session: int = field(default_factory=lambda: secrets.randbits(32))
+    registered: bool = False
     sequence: int = -1
     clock: ClockOffset = field(default_factory=ClockOffset)
     arrived_at_ns: int | None = None
@@ -89,21 +92,55 @@ class Slot:
     versions: Versions = field(default_factory=Versions)
     keys: NDArray[np.uint32] = field(default_factory=lambda: NO_KEYS)
     health: Health = field(default_factory=Health)
-    T_world_camera: Matrix | None = None
-    pose_version: int = 0
-    note: str = ""
+    told_pose: Matrix | None = None
+    warning: str = ""
     asked: deque[_Asked] = field(default_factory=deque)
     last_command: CommandRow | None = None
     told_state: State | None = None
     updates: int = 0
     received_bytes: int = 0
 
-    def set_pose(self, T_world_camera: Matrix | None, note: str = "") -> None:
-        """The camera is elsewhere from now on, or nobody knows where; `note` tells why."""
-        self.T_world_camera = T_world_camera
-        self.pose_version += 1
-        self.note = note
+    id: int = field(init=False)
+    ip: str = field(init=False)
+    T_world_camera: Matrix | None = field(init=False)
+    pose_version: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.become(self.record)
+
+    def become(self, record: UnitRecord) -> None:
+        """What is kept of it is this from now on; with another pose, what it reported is void."""
+        if record.pose_version != self.record.pose_version:
+            self.keys = NO_KEYS
+        self.record = record
+        # Each update asks for these.
+        self.id, self.ip = record.id, record.ip
+        self.T_world_camera, self.pose_version = record.T_world_camera, record.pose_version
+        self.warning = _pose_warning(record, self.told_pose)
+
+    def begin_session(self, told_pose: Matrix | None) -> None:
+        """The unit registered; whatever it said before is void."""
+        # Random, so that a session of a master before this one is never mistaken for a current one.
+        self.session = secrets.randbits(32)
+        self.registered = True
+        self.sequence = -1
+        self.clock = ClockOffset()
+        self.arrived_at_ns = self.captured_at_ns = None
+        self.captures_ns.clear()
         self.keys = NO_KEYS
+        self.health = Health()
+        self.told_pose = told_pose
+        self.warning = _pose_warning(self.record, told_pose)
+
+    @property
+    def serial(self) -> str:
+        """Serial number of the camera."""
+        return self.record.serial
+
+    def is_silent(self, now_ns: int, after_s: float) -> bool:
+        """Whether no update came for `after_s`."""
+        arrival_age_s = self.arrival_age_s(now_ns)
+        return arrival_age_s is None or arrival_age_s > after_s
 
     @property
     def commands(self) -> tuple[Command, ...]:
@@ -186,7 +223,7 @@ class Slot:
         `current` has the versions of the master; its pose counts for nothing, each slot has its own.
         """
         if self.T_world_camera is None:
-            return "uncalibrated", self.note or "its pose is not known yet"
+            return "uncalibrated", self.record.note or "its pose is not known yet"
         if stale := self._stale(now_ns, current, settings):
             trouble = f" ({self.health.trouble})" if self.health.trouble else ""
             return "stale", stale + trouble
@@ -201,6 +238,8 @@ class Slot:
             return "moved", health.moved
         if health.static_share >= MOVED_STATIC_SHARE and health.agreeing_share < MOVED_AGREEING_SHARE:
             return "moved", f"only {health.agreeing_share:.0%} of the known surfaces are where they should be"
+        if self.warning:
+            return "live", f"{self.warning}; {health.warning}" if health.warning else self.warning
         return "live", health.warning or ""
 
     def row(self, now_ns: int, state: State, reason: str) -> UnitRow:
@@ -212,8 +251,8 @@ class Slot:
             id=self.id,
             ip=self.ip,
             serial=self.serial,
-            model=self.model,
-            software=self.software,
+            model=self.record.model,
+            software=self.record.software,
             state=state,
             reason=reason,
             age_s=None if age_s is None else round(age_s, 4),
@@ -225,6 +264,7 @@ class Slot:
             frame_number=self.health.frame,
             health=self.health,
             T_world_camera=self.T_world_camera,
+            pose_origin=self.record.pose_origin,
             versions=self.versions,
             last_command=self.last_command,
         )
@@ -235,7 +275,7 @@ class Slot:
         arrival_age_s, age_s = self.arrival_age_s(now_ns), self.age_s(now_ns)
         uncertainty_ns = self.clock_uncertainty_ns(now_ns)
         if arrival_age_s is None:
-            return "no update since it registered"
+            return "no update since it registered" if self.registered else "no update since the master started"
         if arrival_age_s > limit_s:
             return f"its last update came {arrival_age_s:.1f} s ago, at most {limit_s:g} s are trusted"
         if self.captured_at_ns is None:
@@ -258,12 +298,14 @@ class Slot:
 
 
 class Registry:
-    """All slots: one for each IP, allocated once."""
+    """All slots: one for each IP, allocated once. What changes of them is stored before it counts."""
 
-    def __init__(self) -> None:
-        self._slots: dict[int, Slot] = {}
-        self._by_ip: dict[str, Slot] = {}
-        self._last_id = 0
+    def __init__(self, store: Store, units: Iterable[UnitRecord] = (), last_id: int = 0) -> None:
+        """With the `units` of before, and the last id that was ever given."""
+        self._store = store
+        self._slots = {unit.id: Slot(unit) for unit in units}
+        self._by_ip = {slot.ip: slot for slot in self._slots.values()}
+        self._last_id = last_id
         self._last_command = 0
 
     def __iter__(self) -> Iterator[Slot]:
@@ -278,47 +320,61 @@ class Registry:
         """The slot of this IP with a new session, and the slots that were retired for it.
 
         A camera that turns up behind another IP retires its old slot, once that is silent for `stale_after_s`:
-        two cameras of one serial would otherwise evict each other for ever. Its pose moves along only within one
-        boot of the unit, for then merely the address changed. Another camera in a slot voids the pose.
+        two cameras of one serial would otherwise evict each other for ever, as would two cameras behind one IP. Its
+        pose moves along only within one boot of the unit, for then merely the address changed. Another camera in a
+        slot voids the pose. A pose that the unit was told replaces none but one that a unit was told before.
 
         Raises:
-            Refusal: 409, the camera reports from another IP right now; 503, there are MAX_UNITS already.
+            Refusal: 409, the camera reports from another IP right now, or another camera from this one; 503, there
+                are MAX_UNITS already; 507, it cannot be stored.
         """
         elsewhere = [slot for slot in self if slot.serial == request.serial and slot.ip != ip]
         for old in elsewhere:
-            arrival_age_s = old.arrival_age_s(now_ns)
-            if arrival_age_s is not None and arrival_age_s <= stale_after_s:
+            if not old.is_silent(now_ns, stale_after_s):
                 raise Refusal(409, f"camera {request.serial} reports from IP {old.ip} (unit {old.id}) at this moment")
         slot = self._by_ip.get(ip)
-        if slot is None:
-            if len(self) - len(elsewhere) >= MAX_UNITS:
-                raise Refusal(503, f"no free slot: expected at most {MAX_UNITS} units; delete one that is gone")
-            self._last_id += 1
-            slot = Slot(self._last_id, ip)
-            self._slots[slot.id] = self._by_ip[ip] = slot
-            for old in elsewhere:
-                if old.T_world_camera is not None and old.boot_id and old.boot_id == request.boot_id:
-                    slot.set_pose(old.T_world_camera)
-        elif slot.serial != request.serial:
-            note = f"the camera changed from {slot.serial} to {request.serial}, so its pose is void"
-            logger.warning("unit %d (%s): %s", slot.id, ip, note, extra=slot.log_fields("camera"))
-            slot.set_pose(None, note)
+        if slot is not None and slot.serial != request.serial and not slot.is_silent(now_ns, stale_after_s):
+            raise Refusal(
+                409,
+                f"camera {request.serial}: camera {slot.serial} reports from IP {ip} (unit {slot.id}) at this moment; "
+                "each unit needs an IP of its own",
+            )
+        if slot is None and len(self) - len(elsewhere) >= MAX_UNITS:
+            raise Refusal(503, f"no free slot: expected at most {MAX_UNITS} units; delete one that is gone")
+        record = _registered(request, ip, self._last_id + 1 if slot is None else slot.record, elsewhere)
+        if slot is None or elsewhere or record != slot.record:
+            try:
+                self._store.save_units([record], [old.id for old in elsewhere])
+            except Refusal:
+                if slot is None or elsewhere or record.pose_version != slot.pose_version:
+                    raise
+                # Only its software or its boot is another, for which no view of the cell is given up.
+                record = slot.record
         for old in elsewhere:
             logger.warning(
                 "unit %d (%s): camera %s is at %s now", old.id, old.ip, old.serial, ip, extra=old.log_fields("camera")
             )
-            self.remove(old.id)
-        slot.serial, slot.model, slot.software = request.serial, request.model, request.software
-        slot.boot_id = request.boot_id
-        # Random, so that a session of a master before this one is never mistaken for a current one.
-        slot.session = secrets.randbits(32)
-        slot.sequence = -1
-        slot.clock = ClockOffset()
-        slot.arrived_at_ns = slot.captured_at_ns = None
-        slot.captures_ns.clear()
-        slot.keys = NO_KEYS
-        slot.health = Health()
+            self._drop(old)
+        if slot is None:
+            self._last_id = record.id
+            slot = self._slots[record.id] = self._by_ip[ip] = Slot(record)
+        elif slot.serial != record.serial:
+            logger.warning("unit %d (%s): %s", slot.id, ip, record.note, extra=slot.log_fields("camera"))
+        slot.become(record)
+        slot.begin_session(request.T_world_camera)
+        if slot.warning:
+            logger.warning("unit %d (%s): %s", slot.id, ip, slot.warning, extra=slot.log_fields("pose"))
         return slot, elsewhere
+
+    def set_pose(self, slot: Slot, T_world_camera: Matrix, origin: PoseOrigin) -> None:
+        """The camera is elsewhere from now on.
+
+        Raises:
+            Refusal: 507, it cannot be stored; nothing was changed.
+        """
+        record = slot.record.posed(T_world_camera, origin)
+        self._store.save_units([record])
+        slot.become(record)
 
     def get(self, unit_id: int) -> Slot:
         """The slot with this id.
@@ -346,10 +402,11 @@ class Registry:
         """Forget a unit.
 
         Raises:
-            Refusal: 404, there is none.
+            Refusal: 404, there is none; 507, it cannot be stored.
         """
         slot = self.get(unit_id)
-        del self._slots[unit_id], self._by_ip[slot.ip]
+        self._store.save_units([], [unit_id])
+        self._drop(slot)
 
     def ask(
         self,
@@ -375,3 +432,46 @@ class Registry:
         if verb != "image":
             slot.last_command = CommandRow(id=command.id, verb=verb, outcome=None)
         return command
+
+    def _drop(self, slot: Slot) -> None:
+        del self._slots[slot.id], self._by_ip[slot.ip]
+
+
+def _registered(request: InitializeRequest, ip: str, before: UnitRecord | int, elsewhere: Iterable[Slot]) -> UnitRecord:
+    """What is kept of a unit that registers: `before` is its record, or the id of one that is new."""
+    if isinstance(before, int):
+        record = UnitRecord(id=before, ip=ip)
+        for old in elsewhere:
+            if old.T_world_camera is not None and old.record.boot_id and old.record.boot_id == request.boot_id:
+                record = record.posed(old.T_world_camera, old.record.pose_origin)
+    elif before.serial != request.serial:
+        note = f"the camera changed from {before.serial} to {request.serial}, so its pose is void"
+        record = before.posed(None, None, note)
+    else:
+        record = before
+    told = request.T_world_camera
+    if told is not None and (
+        record.T_world_camera is None or (record.pose_origin in TOLD_ORIGINS and record.T_world_camera != told)
+    ):
+        record = record.posed(told, request.pose_origin)
+    return record.model_copy(
+        update={
+            "serial": request.serial,
+            "model": request.model,
+            "software": request.software,
+            "boot_id": request.boot_id,
+        }
+    )
+
+
+def _pose_warning(record: UnitRecord, told: Matrix | None) -> str:
+    """That a unit was told another pose than counts; empty when not."""
+    if told is None or record.T_world_camera is None or told == record.T_world_camera:
+        return ""
+    known_pose, told_pose = np.array(record.T_world_camera), np.array(told)
+    shift_mm = 1e3 * float(np.linalg.norm(known_pose[:3, 3] - told_pose[:3, 3]))
+    turn_deg = math.degrees(angle_rad(inverse(known_pose) @ told_pose))
+    return (
+        f"the unit's configuration has its camera {shift_mm:.0f} mm and {turn_deg:.1f}° from where it is by the pose "
+        f"that counts ({record.pose_origin})"
+    )

@@ -77,6 +77,8 @@ Matrix = tuple[
 State = Literal["uncalibrated", "live", "stale", "blind", "moved"]
 Verb = Literal["learn_background", "drop_background", "calibrate", "refine", "image"]
 ImageKind = Literal["depth", "expected", "foreground"]
+PoseOrigin = Literal["configured", "board", "refined", "operator", "source"]
+ToldOrigin = Literal["configured", "source"]
 
 
 class Message(BaseModel):
@@ -174,7 +176,18 @@ class InitializeRequest(Message):
     intrinsics: Intrinsics
     software: Label = ""
     boot_id: Label = Field(default="", description="Changes when the unit's monotonic clock starts anew.")
+    T_world_camera: Matrix | None = Field(
+        default=None, description="Where the unit was told that its camera is; the master may know better."
+    )
+    pose_origin: ToldOrigin = "configured"
     sent_at_ns: Nanoseconds
+
+    @field_validator("T_world_camera")
+    @classmethod
+    def _rigid(cls, value: Matrix | None) -> Matrix | None:
+        if value is not None:
+            validated(value, "T_world_camera")
+        return value
 
 
 class InitializeAnswer(Message):
@@ -262,7 +275,7 @@ class PoseRequest(Message):
     """Where a unit's camera is: `T_world_camera` (4, 4), optical frame."""
 
     T_world_camera: Matrix
-    origin: Literal["configured", "board", "refined", "operator", "source"] = "operator"
+    origin: PoseOrigin = "operator"
 
     @field_validator("T_world_camera")
     @classmethod
@@ -323,6 +336,7 @@ class UnitRow(Message):
     frame_number: int
     health: Health
     T_world_camera: Matrix | None
+    pose_origin: PoseOrigin | None = Field(default=None, description="Who said where the camera is.")
     versions: Versions
     last_command: CommandRow | None = None
 

@@ -77,6 +77,8 @@ async def change_cell(request: Request, master: MasterDependency) -> CellAnswer:
             found = await loader.of_document(await _document(request, kind), master.published)
         else:
             raise Refusal(415, f"cell: expected the Content-Type {ZIP} or application/json, got {kind or 'none'}")
+    # Ahead and in a thread, since meshes may be large.
+    await asyncio.to_thread(master.store.add_meshes, found.meshes)
     return master.change_cell(found)
 
 

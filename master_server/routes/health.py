@@ -24,6 +24,7 @@ class HealthAnswer(BaseModel):
     uptime_s: float
     units: int = Field(description="How many have a slot.")
     live: int = Field(description="How many of them are live.")
+    storage: str = Field(description="`ok`, or why the last change could not be stored.")
 
 
 @router.get("/healthz")
@@ -36,6 +37,7 @@ async def healthz(request: Request, master: MasterDependency) -> HealthAnswer:
         uptime_s=round((now_ns - request.app.state.started_at_ns) / NS_PER_S, 1),
         units=len(master.registry),
         live=sum(master.judge(slot, now_ns)[0] == "live" for slot in master.registry),
+        storage="ok" if master.store.trouble is None else "the last change could not be stored",
     )
 
 

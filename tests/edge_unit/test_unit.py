@@ -266,6 +266,8 @@ async def test_another_camera_registers_anew_and_its_pose_is_void(tmp_path: Path
     async with bench.running():
         bench.show(patch(1225))
         await bench.until_state("live")
+        # So long the master holds another camera at this address for another unit.
+        bench.master.change_settings({"stale_after_s": 0.5})
         bench.config = bench.config.model_copy(update={"T_world_camera": None})
         bench.unit._pose = None
         bench.source.serial = "B"

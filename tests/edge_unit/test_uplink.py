@@ -228,16 +228,19 @@ async def test_it_keeps_asking_a_master_that_is_not_there() -> None:
         await asyncio.wait_for(bench.uplink.assigned.wait(), 2.0 * module.RETRY_MAX_S)
 
 
-async def test_a_known_pose_is_told_to_a_master_that_has_none() -> None:
-    bench = Bench(knows_pose=False)
+@pytest.mark.parametrize("knows_pose", [False, True])
+async def test_a_known_pose_is_told_and_what_the_master_answers_counts(knows_pose: bool) -> None:
+    bench = Bench(knows_pose=knows_pose)
+    told = from_xyz_rpy((0.0, 0.0, 0.5), (0.0, 0.0, 0.0))
     task = asyncio.create_task(bench.uplink.run())
-    bench.uplink.set_camera(CAMERA, (POSE, "configured"))
+    bench.uplink.set_camera(CAMERA, (told, "source"))
     await asyncio.wait_for(bench.uplink.assigned.wait(), 5.0)
     task.cancel()
-    assert bench.master.poses == [(7, "configured")]
+    assert bench.master.registrations[0].T_world_camera == matrix_of(told)
+    assert bench.master.registrations[0].pose_origin == "source"
     assert bench.uplink.assignment is not None
-    assert bench.uplink.assignment.versions.pose == 9
-    assert bench.uplink.assignment.T_world_camera is POSE
+    pose = bench.uplink.assignment.T_world_camera
+    assert np.array_equal(pose, POSE) if knows_pose else pose is None
 
 
 async def test_what_the_master_changes_is_a_new_assignment() -> None:

@@ -140,7 +140,7 @@ async def test_what_health_tells_everyone(desk: Desk) -> None:
     await desk.update(await desk.register("10.0.0.2", "B"))
     found = (await desk.call("GET", "/healthz", None)).json()
     assert 0.0 <= found.pop("uptime_s") < 60.0
-    assert found == {"status": "ok", "version": VERSION, "units": 2, "live": 1}
+    assert found == {"status": "ok", "version": VERSION, "units": 2, "live": 1, "storage": "ok"}
 
 
 async def test_what_monitoring_reads(desk: Desk) -> None:

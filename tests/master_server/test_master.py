@@ -13,7 +13,18 @@ from master_server.registry import COMMAND_EXPIRES_S, FPS_FRAMES, MAX_UNITS
 from shared.cell import Cell
 from shared.errors import InputError, Refusal, WireError
 from shared.lattice import Lattice
-from shared.messages import CONTRACT_VERSION, DONE, MAX_COMMANDS, CommandRow, Health, JointsRequest, Outcome, Versions
+from shared.messages import (
+    CONTRACT_VERSION,
+    DONE,
+    MAX_COMMANDS,
+    CommandRow,
+    Health,
+    JointsRequest,
+    Matrix,
+    Outcome,
+    PoseOrigin,
+    Versions,
+)
 from shared.settings import Settings
 from shared.timebase import Exchange
 from tests.master_server.fakes import AT_ORIGIN, GOOD, MS, START_NS, FakeUnit, S, joined, master, sees_all
@@ -70,7 +81,7 @@ def test_another_camera_in_a_slot_voids_its_pose_and_says_so() -> None:
     one = master()
     live(one, 1, 5)
     other = FakeUnit(one, ip="10.0.0.1", serial="B")
-    assert other.initialize(NOW_NS, pose=None).T_world_camera is None
+    assert other.initialize(LATER_NS, pose=None).T_world_camera is None
     assert state(one, other) == ("uncalibrated", "the camera changed from S1 to B, so its pose is void")
     other.update(NOW_NS, [5])
     assert shown(one) == {}
@@ -527,3 +538,66 @@ def test_a_unit_gets_the_joints_that_it_lacks() -> None:
     assert unit.update(NOW_NS + 51 * MS).joints == ()
     one.put_joints(JointsRequest(positions=(0.5, 0.0)), NOW_NS + 52 * MS)
     assert len(unit.update(NOW_NS + 53 * MS).joints) == 1
+
+
+# ---------------------------------------------------------------------- whose pose counts
+
+
+def tell(
+    one: Master, pose: Matrix | None, ip: str = "10.0.0.1", serial: str = "S1", now_ns: int = LATER_NS
+) -> FakeUnit:
+    """A unit that registers with the pose that its configuration has."""
+    unit = FakeUnit(one, ip=ip, serial=serial)
+    request = unit.introduction(now_ns - MS).model_copy(update={"T_world_camera": pose})
+    unit.initialized = one.initialize(request, ip, now_ns)
+    unit.exchange = Exchange(now_ns - MS, now_ns, now_ns, now_ns + MS)
+    unit.versions = unit.initialized.versions
+    unit.update(now_ns + MS, [1])
+    return unit
+
+
+def shifted(x_m: float) -> Matrix:
+    return ((1.0, 0.0, 0.0, x_m), *AT_ORIGIN[1:])
+
+
+def test_a_configured_pose_that_changed_replaces_a_configured_one() -> None:
+    one = master()
+    first = tell(one, shifted(0.1))
+    assert first.initialized.T_world_camera == shifted(0.1)
+    again = tell(one, shifted(0.1), now_ns=LATER_NS + S)
+    assert again.initialized.versions.pose == first.initialized.versions.pose
+    moved = tell(one, shifted(0.2), now_ns=LATER_NS + 2 * S)
+    assert moved.initialized.T_world_camera == shifted(0.2)
+    assert moved.initialized.versions.pose == first.initialized.versions.pose + 1
+    row = one.units(LATER_NS + 2 * S)[0]
+    assert (row.pose_origin, row.reason) == ("configured", "")
+    # Without one in its configuration it keeps what it had.
+    assert tell(one, None, now_ns=LATER_NS + 3 * S).initialized.T_world_camera == shifted(0.2)
+
+
+@pytest.mark.parametrize("origin", ["operator", "board", "refined"])
+def test_a_configured_pose_never_replaces_a_better_one_and_the_row_says_so(origin: PoseOrigin) -> None:
+    one = master()
+    tell(one, shifted(0.1))
+    one.set_pose(1, shifted(0.5), origin, None)
+    unit = tell(one, shifted(0.2))
+    assert unit.initialized.T_world_camera == shifted(0.5)
+    row = one.units(LATER_NS + MS)[0]
+    assert (row.state, row.pose_origin) == ("live", origin)
+    assert row.reason == (
+        f"the unit's configuration has its camera 300 mm and 0.0° from where it is by the pose that counts ({origin})"
+    )
+    one.set_pose(1, shifted(0.2), "operator", None)
+    assert one.registry.get(1).warning == ""
+
+
+def test_two_cameras_behind_one_address_do_not_take_turns() -> None:
+    one = master()
+    first = live(one, 1, 5)
+    other = FakeUnit(one, ip="10.0.0.1", serial="B")
+    with pytest.raises(Refusal, match=r"camera S1 reports from IP 10\.0\.0\.1 .*an IP of its own") as caught:
+        other.initialize(NOW_NS + 100 * MS)
+    assert caught.value.status == 409
+    first.update(NOW_NS + 200 * MS, [6])
+    assert shown(one, NOW_NS + 200 * MS) == {6: 1}
+    assert one.units(NOW_NS)[0].serial == "S1"

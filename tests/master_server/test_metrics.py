@@ -11,7 +11,7 @@ from master_server.registry import MAX_UNITS
 from master_server.stream import Stream
 from shared.clock import NS_PER_US, monotonic_ns
 from shared.messages import JointsRequest
-from tests.master_server.fakes import MS, S, joined, master, sees_all
+from tests.master_server.fakes import MS, FakeUnit, S, joined, master, sees_all
 
 
 def samples(metrics: Metrics) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
@@ -75,8 +75,7 @@ def test_series_of_a_deleted_unit_vanish() -> None:
 
 def test_what_a_unit_calls_itself_breaks_no_line() -> None:
     one = master()
-    unit = joined(one, 1)
-    one.registry.get(unit.initialized.id).serial = 'a"} 7\\'
+    FakeUnit(one, serial='a"} 7\\').initialize()
     assert any(("serial", 'a"} 7\\') in labels for _, labels in samples(Metrics(one, Stream(one))))
 
 

@@ -1,0 +1,372 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What must outlive the master, in one SQLite file: units with their poses, settings, versions and the cell.
+
+Whoever changes something writes it here first and changes the memory then, so that what a caller was told is on the
+disk, and what could not be written did not happen. The write is done by the event loop itself and not by a thread:
+between check and commit no other change can come in, no rollback of memory is needed, and a change is a matter of a
+few kilobytes and one fsync, some milliseconds. An update writes nothing. Only meshes are long; `add_meshes` may be
+called by a thread before, which leaves the document to `save_cell`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import sqlite3
+import threading
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from shared.cell import Cell
+from shared.configuration import sentence
+from shared.errors import CellError, ConfigError, Refusal
+from shared.messages import Counter, Matrix, Message, PoseOrigin, Versions
+from shared.settings import Settings
+
+logger = logging.getLogger(__name__)
+
+FILE_NAME = "master.db"
+
+APPLICATION_ID = 0x43574D53
+"""In the file's header, so that a database of something else is never taken for ours."""
+
+SCHEMA_VERSION = 1
+
+LOCK_TIMEOUT_S = 3.0
+"""A master that was told to stop has let go of its file by then."""
+
+LOG_BYTES = 2**22
+"""What SQLite's log may keep of the disk once its content is in the file."""
+
+SCHEMA = f"""
+CREATE TABLE units (
+    id INTEGER PRIMARY KEY,
+    ip TEXT NOT NULL UNIQUE,
+    serial TEXT NOT NULL,
+    model TEXT NOT NULL,
+    software TEXT NOT NULL,
+    boot_id TEXT NOT NULL,
+    T_world_camera TEXT,
+    pose_origin TEXT,
+    pose_version INTEGER NOT NULL,
+    note TEXT NOT NULL
+);
+CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE meshes (sha256 TEXT PRIMARY KEY, data BLOB NOT NULL);
+PRAGMA application_id = {APPLICATION_ID};
+PRAGMA user_version = {SCHEMA_VERSION};
+"""
+
+
+class UnitRecord(Message):
+    """What is kept of a unit; immutable, a change is a new record."""
+
+    id: Counter
+    ip: str
+    serial: str = ""
+    model: str = ""
+    software: str = ""
+    boot_id: str = ""
+    T_world_camera: Matrix | None = None
+    pose_origin: PoseOrigin | None = None
+    pose_version: Counter = 0
+    note: str = ""
+
+    def posed(self, T_world_camera: Matrix | None, origin: PoseOrigin | None, note: str = "") -> UnitRecord:
+        """The same unit with its camera elsewhere, or where nobody knows; `note` tells why."""
+        return self.model_copy(
+            update={
+                "T_world_camera": T_world_camera,
+                "pose_origin": origin,
+                "pose_version": self.pose_version + 1,
+                "note": note,
+            }
+        )
+
+
+@dataclass(frozen=True)
+class Saved:
+    """All that was stored. `settings` and `configured` are as they were written, maybe by another version.
+
+    Attributes:
+        units: by id.
+        last_id: the last one that was ever given.
+        versions: None in a store in which no master has begun yet.
+        settings: all of them.
+        configured: those that the configuration had set when the master was last started.
+        cell: the one that was watched.
+        cell_file: hash of the cell that was last loaded from a file.
+    """
+
+    units: tuple[UnitRecord, ...] = ()
+    last_id: int = 0
+    versions: Versions | None = None
+    settings: dict[str, Any] = field(default_factory=dict)
+    configured: dict[str, Any] = field(default_factory=dict)
+    cell: Cell | None = None
+    cell_file: str = ""
+
+
+class Store:
+    """One connection to the file, held by one master alone; each change is one transaction."""
+
+    def __init__(self, connection: sqlite3.Connection, name: str) -> None:
+        """Use `Store.open` or `Store.in_memory`."""
+        self._connection = connection
+        self._name = name
+        self._lock = threading.Lock()
+        self._named: frozenset[str] = frozenset()
+        self.trouble: str | None = None
+        """Why the last change could not be stored, in one sentence; None since one could again."""
+
+    @classmethod
+    def in_memory(cls) -> Store:
+        """A store that forgets everything with its process."""
+        connection = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
+        connection.executescript(SCHEMA)
+        return cls(connection, ":memory:")
+
+    @classmethod
+    def open(cls, path: Path) -> Store:
+        """The store in this file; made if there is none.
+
+        Raises:
+            ConfigError: it cannot be read or written, is damaged, is no store of a master, is one of a newer
+                version, or another master holds it. It is left as it is.
+        """
+        try:
+            if not path.exists():
+                _make(path)
+            connection = sqlite3.connect(path, LOCK_TIMEOUT_S, isolation_level=None, check_same_thread=False)
+        except (sqlite3.Error, OSError) as error:
+            raise ConfigError(f"{path}: cannot open what the master keeps: {error}") from error
+        try:
+            _check(connection, path)
+        except BaseException as error:
+            connection.close()
+            if isinstance(error, sqlite3.OperationalError) and "locked" in str(error):
+                raise ConfigError(f"{path}: another master is running on it; stop that, or use --state-dir") from error
+            if isinstance(error, sqlite3.OperationalError):
+                raise ConfigError(f"{path}: cannot read and write what the master keeps: {error}") from error
+            if isinstance(error, sqlite3.Error):
+                raise _damaged(path, str(error)) from error
+            raise
+        return cls(connection, str(path))
+
+    def close(self) -> None:
+        """Let go of the file."""
+        with self._lock:
+            self._connection.close()
+
+    def load(self) -> Saved:
+        """All that was stored.
+
+        Raises:
+            ConfigError: it is damaged.
+        """
+        try:
+            with self._lock:
+                columns = ", ".join(UnitRecord.model_fields)
+                rows = self._connection.execute(f"SELECT {columns} FROM units ORDER BY id").fetchall()
+                facts = {
+                    name: json.loads(value) for name, value in self._connection.execute("SELECT name, value FROM facts")
+                }
+                meshes = dict(self._connection.execute("SELECT sha256, data FROM meshes").fetchall())
+            units = tuple(_record(row) for row in rows)
+            self._named = frozenset(meshes)
+            return Saved(
+                units=units,
+                last_id=max([int(facts.get("last_id", 0)), *(unit.id for unit in units)]),
+                versions=Versions.model_validate(facts["versions"]) if "versions" in facts else None,
+                settings=dict(facts.get("settings", {})),
+                configured=dict(facts.get("configured", {})),
+                cell=Cell.from_document(facts["cell"], meshes) if "cell" in facts else None,
+                cell_file=str(facts.get("cell_file", "")),
+            )
+        except ValidationError as error:
+            raise _damaged(self._name, sentence(error)) from error
+        except (sqlite3.Error, CellError, ValueError, TypeError) as error:
+            raise _damaged(self._name, str(error)) from error
+
+    # ------------------------------------------------------------------ changes; each raises Refusal, 507
+
+    def begin(
+        self, cell: Cell, cell_file: str, settings: Settings, configured: Mapping[str, Any], versions: Versions
+    ) -> None:
+        """What a master begins with: the cell that it watches, the hash of that in the file, and its settings."""
+        document, meshes = cell.to_document()
+        with self._transaction() as connection:
+            _put(connection, "configured", configured)
+            _put(connection, "cell_file", cell_file)
+            _put(connection, "settings", settings.model_dump(mode="json"))
+            _put_cell(connection, document, meshes)
+            _put(connection, "versions", versions.model_dump())
+        self._named = frozenset(meshes)
+
+    def save_units(self, changed: Iterable[UnitRecord], gone: Iterable[int] = ()) -> None:
+        """Units that are new or changed, and ids of those that are no more, in one transaction."""
+        names = tuple(UnitRecord.model_fields)
+        updates = ", ".join(f"{name} = excluded.{name}" for name in names[1:])
+        statement = (
+            f"INSERT INTO units ({', '.join(names)}) VALUES ({', '.join('?' * len(names))}) "
+            f"ON CONFLICT (id) DO UPDATE SET {updates}"
+        )
+        with self._transaction() as connection:
+            connection.executemany("DELETE FROM units WHERE id = ?", [(unit_id,) for unit_id in gone])
+            for unit in changed:
+                fields = dict(unit)
+                fields["T_world_camera"] = None if unit.T_world_camera is None else json.dumps(unit.T_world_camera)
+                connection.execute(statement, tuple(fields.values()))
+                connection.execute(
+                    "INSERT INTO facts VALUES ('last_id', ?) ON CONFLICT (name) DO UPDATE SET value = excluded.value "
+                    "WHERE CAST(excluded.value AS INTEGER) > CAST(value AS INTEGER)",
+                    (str(unit.id),),
+                )
+
+    def save_settings(self, settings: Settings, versions: Versions) -> None:
+        """Changed settings, and the versions that come with them."""
+        with self._transaction() as connection:
+            _put(connection, "settings", settings.model_dump(mode="json"))
+            _put(connection, "versions", versions.model_dump())
+
+    def add_meshes(self, meshes: Mapping[str, bytes]) -> None:
+        """Meshes by their sha256, ahead of the cell that names them; may be called by a thread.
+
+        Those that were ahead before, of a cell that was refused, make room.
+        """
+        with self._transaction() as connection:
+            _drop_meshes(connection, self._named | set(meshes))
+        for mesh in meshes.items():
+            with self._transaction() as connection:
+                connection.execute("INSERT OR IGNORE INTO meshes VALUES (?, ?)", mesh)
+
+    def save_cell(self, document: Mapping[str, Any], meshes: Mapping[str, bytes], versions: Versions) -> None:
+        """A cell as of `Cell.to_document`, and the versions that come with it; meshes of the one before are dropped."""
+        with self._transaction() as connection:
+            _put_cell(connection, document, meshes)
+            _put(connection, "versions", versions.model_dump())
+        self._named = frozenset(meshes)
+
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
+        with self._lock:
+            try:
+                self._connection.execute("BEGIN IMMEDIATE")
+                yield self._connection
+                self._connection.execute("COMMIT")
+            except sqlite3.Error as error:
+                sentence = f"cannot store anything in {self._name}: {error}"
+                if self.trouble is None:
+                    logger.error("%s; changes are refused until it can", sentence, extra={"event": "storage"})
+                self.trouble = sentence
+                raise Refusal(507, f"nothing was changed: the master cannot store it ({error})") from error
+            finally:
+                if self._connection.in_transaction:
+                    # SQLite has undone by itself what it could not write.
+                    with contextlib.suppress(sqlite3.Error):
+                        self._connection.execute("ROLLBACK")
+            if self.trouble is not None:
+                logger.info("changes can be stored again", extra={"event": "storage"})
+            self.trouble = None
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the names of a folder's files on the disk, as fsync has their content.
+
+    Raises:
+        OSError: it cannot be opened, or the disk fails.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _make(path: Path) -> None:
+    """Make an empty store, whole or not at all: a file under this name always is one."""
+    left_over = path.with_name(path.name + "-wal")
+    if left_over.exists():
+        raise ConfigError(
+            f"{path}: expected the file that {left_over.name} belongs to, got none; "
+            f"put it back, or delete {left_over.name} too to begin anew"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    partial = path.with_suffix(".partial")
+    for name in (partial, partial.with_name(partial.name + "-wal"), partial.with_name(partial.name + "-journal")):
+        name.unlink(missing_ok=True)
+    os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
+    connection = sqlite3.connect(partial, isolation_level=None)
+    try:
+        connection.execute("PRAGMA synchronous = FULL")
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.executescript(f"BEGIN; {SCHEMA} COMMIT;")
+    finally:
+        connection.close()
+    partial.replace(path)
+    sync_folder(path.parent)
+
+
+def _check(connection: sqlite3.Connection, path: Path) -> None:
+    # Alone with the file, it needs no memory that processes share, and a second master cannot come in.
+    connection.execute("PRAGMA locking_mode = EXCLUSIVE")
+    connection.execute("PRAGMA synchronous = FULL")
+    if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
+        raise _damaged(path, "it is no store of a master")
+    version = connection.execute("PRAGMA user_version").fetchone()[0]
+    if version > SCHEMA_VERSION:
+        raise ConfigError(
+            f"{path}: expected a store of version {SCHEMA_VERSION}, got version {version}: it was written by a newer "
+            "master-server; install that again, or use another --state-dir"
+        )
+    # A page that was cut short is filled up in silence; while there is a log it has the page as a whole.
+    log = path.with_name(path.name + "-wal")
+    page_bytes = connection.execute("PRAGMA page_size").fetchone()[0]
+    if (not log.exists() or log.stat().st_size == 0) and path.stat().st_size % page_bytes:
+        raise _damaged(path, "its end is missing")
+    if (found := connection.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
+        raise _damaged(path, found)
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute(f"PRAGMA journal_size_limit = {LOG_BYTES}")
+    # Takes the lock, which a read alone would not keep others from.
+    connection.execute("BEGIN IMMEDIATE")
+    connection.execute("ROLLBACK")
+
+
+def _damaged(path: Path | str, what: str) -> ConfigError:
+    return ConfigError(
+        f"{path}: expected what a master keeps between its runs, got something else or a damaged file ({what}); "
+        "put back a copy, or move it and what begins with its name away to begin anew: units, poses and settings "
+        "are then to be set again"
+    )
+
+
+def _record(row: tuple[Any, ...]) -> UnitRecord:
+    fields = dict(zip(UnitRecord.model_fields, row, strict=True))
+    pose = fields["T_world_camera"]
+    return UnitRecord.model_validate({**fields, "T_world_camera": None if pose is None else json.loads(pose)})
+
+
+def _put(connection: sqlite3.Connection, name: str, value: Any) -> None:
+    connection.execute("INSERT OR REPLACE INTO facts VALUES (?, ?)", (name, json.dumps(value)))
+
+
+def _put_cell(connection: sqlite3.Connection, document: Mapping[str, Any], meshes: Mapping[str, bytes]) -> None:
+    _put(connection, "cell", document)
+    stored = _drop_meshes(connection, meshes)
+    news = [mesh for mesh in meshes.items() if mesh[0] not in stored]
+    connection.executemany("INSERT INTO meshes VALUES (?, ?)", news)
+
+
+def _drop_meshes(connection: sqlite3.Connection, named: Collection[str]) -> set[str]:
+    """Drop all meshes but the `named` ones; returns those that are there."""
+    stored = {sha256 for (sha256,) in connection.execute("SELECT sha256 FROM meshes")}
+    old = stored.difference(named)
+    connection.executemany("DELETE FROM meshes WHERE sha256 = ?", [(sha256,) for sha256 in old])
+    return stored - old

@@ -24,6 +24,10 @@ WRONG_TOKENS_BURST = 20
 TRUSTED_S = 60.0
 """An address that showed a valid token is not shut out for another's guesses at the same address for so long."""
 
+COMPLAINTS_PER_S = 1.0
+COMPLAINTS_BURST = 20
+"""Lines of the log about one address: enough to see what is wrong, too few to fill a disk."""
+
 CONNECTIONS_PER_S = 250.0
 CONNECTIONS_BURST = 500
 """A script that connects anew for joints at 125 Hz stays below."""
@@ -76,6 +80,7 @@ class Limits:
         self.requests = RateLimit(REQUESTS_PER_S, REQUESTS_BURST)
         self.wrong_tokens = RateLimit(WRONG_TOKENS_PER_S, WRONG_TOKENS_BURST)
         self.new_connections = RateLimit(CONNECTIONS_PER_S, CONNECTIONS_BURST)
+        self._complaints = RateLimit(COMPLAINTS_PER_S, COMPLAINTS_BURST)
         self._trusted_at_ns: dict[str, int] = {}
         self._open: dict[str, int] = {}
         self._open_count = 0
@@ -94,6 +99,13 @@ class Limits:
     def read(self, ip: str, body_bytes: int, now_ns: int) -> None:
         """Count a body that was read; the request after it may be refused for it."""
         self.requests.spend(ip, now_ns, body_bytes / BODY_BYTES_A_REQUEST)
+
+    def may_be_logged(self, ip: str, now_ns: int) -> bool:
+        """Whether the log has room for one more line about this address; if so it is counted."""
+        if self._complaints.wait_ns(ip, now_ns) > 0:
+            return False
+        self._complaints.spend(ip, now_ns)
+        return True
 
     def may_show_token(self, ip: str, now_ns: int) -> None:
         """Before a token is looked at.

@@ -112,6 +112,8 @@ def log_refusal(scope: Scope, error: CellwatchError) -> None:
     status = status_of(error)
     client = scope.get("client")
     ip = plain_ip(str(client[0])) if client else ""
+    if not limits_of(HTTPConnection(scope)).may_be_logged(ip, monotonic_ns()):
+        return
     # A stranger may ask for any path.
     path = repr(scope["path"])[1:-1][:SHOWN_PATH_CHARS]
     asked = f"{scope.get('method', 'WS')} {path}"

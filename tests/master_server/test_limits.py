@@ -161,3 +161,14 @@ async def test_guessing_ends_with_429(method: str, path: str) -> None:
     for guess in range(2 * WRONG_TOKENS_BURST):
         await desk.call("GET", "/units", f"guess-{guess:020d}", "10.0.0.2")
     assert (await desk.call("GET", "/units", UNIT, "10.0.0.2", headers=MSGPACK)).status_code == 200
+
+
+async def test_an_address_that_is_refused_again_and_again_does_not_fill_the_log(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    desk = Desk(make_app(master(), Access(UNIT.encode(), OPERATOR.encode())))
+    for _ in range(5 * limits_module.COMPLAINTS_BURST):
+        await desk.call("POST", "/update", UNIT, content=b"\xc1", headers=MSGPACK)
+    assert 0 < caplog.text.count("from 10.0.0.1 refused") <= limits_module.COMPLAINTS_BURST + 5
+    await desk.call("POST", "/update", UNIT, "10.0.0.2", content=b"\xc1", headers=MSGPACK)
+    assert "from 10.0.0.2 refused" in caplog.text

@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps source-faults faults bench-pipeline bench-board bench-master pictures test lint clean libusb
+.PHONY: help demo real sweeps source-faults faults bench-pipeline bench-board bench-master bench-stance pictures test lint clean libusb
 
 ARGS ?=
 EXTRAS := edge,master,realsense,sim,dev
@@ -46,6 +46,9 @@ bench-master: $(READY) ## how many units one master bears, beside a bare route o
 
 bench-board: $(READY) ## how well a camera's pose is found by a calibration board, by distance
 	@$(BIN)/python -m benchmarks.board $(ARGS)
+
+bench-stance: $(READY) ## how soon a knocked or covered camera is told, and how often one is wrongly suspected
+	@$(BIN)/python -m benchmarks.stance $(ARGS)
 
 pictures: $(READY) ## the pictures of the README, painted anew
 	@$(BIN)/python -m simulation.picture assets/pictures/demo.png

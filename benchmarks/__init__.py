@@ -10,6 +10,7 @@ In the order of the flow:
     quiet      a cell in which nothing but the robot moves: no voxel may be reported
     walkers    people in the simulated cell: how much of them is missed
     sweeps     all of these, as one table
+    stance     how soon a knocked camera is told, and how often one that hangs still is suspected
     board      how well a camera's pose is found by a calibration board
     real_frames the real recordings, and what must come out of them
     real         a real master and a real unit on them, judged frame by frame

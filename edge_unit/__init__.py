@@ -27,6 +27,7 @@ In the order of the flow:
     board_print     the board as a PDF at exact scale
     pose_mean       the mean of many measurements of one pose
     localise        the camera's pose by the board: pictures in, pose out
+    board_search    looks for the board through the source's own pictures
     joints          the robot's joints at a frame's time
     trust           which master a unit believes, by its certificate
     client          what a unit can ask the master

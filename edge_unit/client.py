@@ -19,6 +19,7 @@ from shared.messages import (
     InitializeAnswer,
     InitializeRequest,
     PoseAnswer,
+    PoseQuality,
     PoseRequest,
     RobotAnswer,
     UpdateAnswer,
@@ -126,9 +127,12 @@ class MasterClient:
         data = await self._call("GET", f"/robot?since_ns={since_ns}", timeout=httpx.Timeout(timeout_s))
         return decode(RobotAnswer, data)
 
-    async def put_pose(self, unit_id: int, T_world_camera: Transform, origin: str) -> int:
+    async def put_pose(
+        self, unit_id: int, T_world_camera: Transform, origin: str, quality: PoseQuality | None = None
+    ) -> int:
         """Tell where the camera is; returns the version of the pose. Raises as `update`."""
-        request = PoseRequest.model_validate({"T_world_camera": T_world_camera.tolist(), "origin": origin})
+        document = {"T_world_camera": T_world_camera.tolist(), "origin": origin, "quality": quality or PoseQuality()}
+        request = PoseRequest.model_validate(document)
         data = await self._call("PUT", f"/units/{unit_id}/pose", encode(request))
         return decode(PoseAnswer, data).pose
 

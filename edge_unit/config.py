@@ -12,6 +12,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, field_validator, model_validator
 
+from edge_unit.sources.image import ImageStream
 from edge_unit.sources.realsense import RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSourceConfig, read_pose
 from edge_unit.sources.simulated import SimulatedSourceConfig
@@ -94,6 +95,10 @@ class UnitConfig(Configured):
     T_world_camera: PoseConfig | None = Field(
         default=None, description="The camera's pose, told to a master that has none for this unit."
     )
+    localise: bool = Field(
+        default=True, description="Look for the cell's board while nobody knows the camera's pose; else when asked."
+    )
+    board_stream: ImageStream = Field(default="infrared", description="In which the board is looked for, or color.")
     learn_background_frames: int = Field(
         default=0, ge=0, le=10_000, description="Learn the empty cell from so many frames, unless it is known already."
     )

@@ -130,7 +130,16 @@ class BoardLocaliser:
     @property
     def frames_with_pose(self) -> int:
         """Pictures so far that tell a pose."""
-        return sum(sighting.T_board_image is not None for sighting in self._sightings)
+        return len(self._posed)
+
+    @property
+    def _posed(self) -> list[Sighting]:
+        least = min(MIN_MARKERS, self._markers_total)
+        return [
+            sighting
+            for sighting in self._sightings
+            if sighting.T_board_image is not None and sighting.detection.markers >= least
+        ]
 
     def clear(self) -> None:
         """Forget all pictures."""
@@ -149,9 +158,8 @@ class BoardLocaliser:
             BoardError: they do not tell it; one sentence that says why, and what to do.
         """
         seen = self._sightings
-        posed = [sighting for sighting in seen if sighting.T_board_image is not None]
-        markers = int(np.median([sighting.detection.markers for sighting in seen])) if seen else 0
-        self._check_sight(posed, markers)
+        posed = self._posed
+        self._check_sight(posed)
         mean = mean_pose(np.array([sighting.T_board_image for sighting in posed]))
         used = [sighting for sighting, good in zip(posed, mean.used, strict=True) if good]
         common = np.median([sighting.covariance for sighting in used], axis=0)
@@ -173,11 +181,11 @@ class BoardLocaliser:
             reprojection_px,
             len(used),
             len(seen),
-            markers,
+            int(np.median([sighting.detection.markers for sighting in used])),
             self._markers_total,
         )
 
-    def _check_sight(self, posed: list[Sighting], markers: int) -> None:
+    def _check_sight(self, posed: list[Sighting]) -> None:
         """Is the board seen well enough?"""
         total, seen = self._markers_total, self._sightings
         if not any(sighting.detection.markers for sighting in seen):
@@ -197,10 +205,11 @@ class BoardLocaliser:
                 "the markers do not lie as on this cell's board: compare the printed board with `board` in cell.yaml, "
                 "and take other markers of its dictionary out of view"
             )
-        if markers < min(MIN_MARKERS, total) or len(posed) < MIN_FRAMES:
+        markers = int(np.median([sighting.detection.markers for sighting in seen]))
+        if len(posed) < MIN_FRAMES:
             raise BoardError(
                 f"{markers} of {total} markers were seen, and a pose in {len(posed)} of {len(seen)} pictures, expected "
-                f"at least {min(MIN_MARKERS, total)} and {MIN_FRAMES}: take away what hides the board, light it evenly"
+                f"{min(MIN_MARKERS, total)} markers in {MIN_FRAMES} pictures: take away what hides the board, light it"
             )
         reprojection_px = float(np.median([sighting.reprojection_px for sighting in posed]))
         if reprojection_px > MAX_REPROJECTION_PX:

@@ -21,6 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.background import BackgroundStore, Place
+from edge_unit.board_layout import require_board
+from edge_unit.board_search import BoardSearch
 from edge_unit.camera_memory import CameraMemory
 from edge_unit.cell_cache import CellCache
 from edge_unit.client import MasterClient
@@ -38,9 +40,9 @@ from edge_unit.sources.status import ReportsStatus
 from edge_unit.stance import Stance, Verdict, place_of
 from edge_unit.trace import Trace, TraceRecord
 from edge_unit.uplink import Assignment, Report, Uplink
-from shared.clock import NS_PER_MS, NS_PER_S
+from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, InputError, SourceError
-from shared.messages import DONE, MAX_TEXT, MAX_VOXELS, Command, Health, ImageKind, ToldOrigin
+from shared.messages import DONE, MAX_TEXT, MAX_VOXELS, Command, Health, ImageKind, PoseQuality, ToldOrigin
 from shared.settings import FilterSettings
 from shared.transforms import Transform
 from shared.wire import keys_to_bytes
@@ -61,7 +63,6 @@ DRAIN_S = 2.0
 """For the last frame of a recording to reach the master."""
 
 CANNOT = {
-    "calibrate": "this unit cannot look for the calibration board",
     "refine": "this unit cannot refine its pose by the CAD",
 }
 """What is asked of units that they are not able to do, in words for the operator."""
@@ -107,6 +108,7 @@ class Unit:
         self._applied: Assignment | None = None
         self._learning: _Learning | None = None
         self._rehearsal: asyncio.Task[None] | None = None
+        self._search = BoardSearch(source, config.board_stream)
         self._next_at_ns = 0
         self._sending: set[asyncio.Task[None]] = set()
         self._trouble: str | None = "no frame yet"
@@ -226,17 +228,30 @@ class Unit:
         assignment = self.uplink.assignment or self._applied
         if assignment is None:
             return
+        commands = self._take_commands()
+        asked = [command for command in commands if command.verb == "calibrate"]
+        if asked:
+            for command in commands:
+                if command not in asked:
+                    self.uplink.commands.put_nowait(command)
+            outcome = await self._localise(assignment, frame)
+            for command in asked:
+                self.uplink.finish(command, outcome)
+            # The frame is of before the look, and its memory may be gone.
+            return
         if assignment.T_world_camera is None:
             self._pipeline = None
-            commands = self._take_commands()
             for command in commands:
                 if command.verb != "image":
                     self.uplink.finish(command, CANNOT.get(command.verb, NO_POSE))
-            self.uplink.offer(Report(assignment, frame.captured_at_ns, health=Health(frame=frame.frame_number)))
+            searching = f"looking for the board: {self._search.outcome}"[:MAX_TEXT] if self._search.outcome else None
+            health = Health(frame=frame.frame_number, trouble=searching)
+            self.uplink.offer(Report(assignment, frame.captured_at_ns, health=health))
             await self._show(commands, frame, None)
+            if self._localises(assignment) and self._search.due(monotonic_ns()):
+                await self._localise(assignment, frame)
             return
         joints = await self._joints_at(assignment, frame)
-        commands = self._take_commands()
         report = await asyncio.to_thread(self._process, assignment, assignment.T_world_camera, frame, joints, commands)
         if (report.health.trouble is None) != (self._trouble is None):
             logger.info("%s", report.health.trouble or "frames are filtered and reported")
@@ -267,6 +282,39 @@ class Unit:
             self.uplink.finish(command, str(error))
         else:
             self.uplink.finish(command)
+
+    def _localises(self, assignment: Assignment) -> bool:
+        """Whether to look for the board without being asked."""
+        return self._config.localise and assignment.cell.board is not None
+
+    async def _localise(self, assignment: Assignment, frame: DepthFrame) -> str:
+        """Look for the board while depth pauses, and tell the master the pose; returns what came of it."""
+
+        def tell(seen: str) -> None:
+            self.uplink.offer(_troubled(assignment, frame, seen))
+
+        search = self._search
+        first = not search.outcome
+        try:
+            found = await search.look(require_board(assignment.cell.board), tell)
+            quality = PoseQuality(
+                uncertainty_mm=round(found.uncertainty_mm, 3),
+                uncertainty_deg=round(found.uncertainty_deg, 4),
+                reprojection_px=round(found.reprojection_px, 4),
+            )
+            await self.uplink.tell_pose(found.T_world_camera, "board", quality)
+        except CellwatchError as error:
+            # It looks for ever, but says so once.
+            logger.log(logging.WARNING if first else logging.DEBUG, "%s", error)
+            return str(error)
+        logger.info(
+            "found the board in %d of %d pictures: the pose is known to %.1f mm and %.2f degrees",
+            found.frames_used,
+            found.frames_seen,
+            found.uncertainty_mm,
+            found.uncertainty_deg,
+        )
+        return DONE
 
     async def _joints_at(self, assignment: Assignment, frame: DepthFrame) -> JointEstimate | None:
         """Where the robot was when the frame was taken; None when nobody knows."""

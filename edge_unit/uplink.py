@@ -31,6 +31,7 @@ from shared.messages import (
     Health,
     InitializeRequest,
     Outcome,
+    PoseQuality,
     SeenReport,
     ToldOrigin,
     UpdateAnswer,
@@ -155,6 +156,15 @@ class Uplink:
         """Send the picture that a command asks for. Raises as `MasterClient.update`."""
         assert command.image is not None
         await self._client.put_image(self._id, command.image, command.id, png)
+
+    async def tell_pose(self, T_world_camera: Transform, origin: str, quality: PoseQuality) -> None:
+        """This unit's camera was found to be there; it comes back with the answer to an update, as every pose.
+
+        Raises:
+            UplinkError: the master did not hear of it, or refused it.
+            WireError: its answer is none of ours.
+        """
+        await self._client.put_pose(self._id, T_world_camera, origin, quality)
 
     async def drained(self, timeout_s: float) -> None:
         """Wait until nothing is left to be sent, but no longer than `timeout_s`."""

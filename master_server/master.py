@@ -36,6 +36,7 @@ from shared.messages import (
     LatticeDescription,
     Matrix,
     PoseOrigin,
+    PoseQuality,
     RobotAnswer,
     State,
     UnitRow,
@@ -197,7 +198,14 @@ class Master:
         self._withdraw(unit_id)
         self._changed()
 
-    def set_pose(self, unit_id: int, T_world_camera: Matrix, origin: PoseOrigin, ip: str | None) -> int:
+    def set_pose(
+        self,
+        unit_id: int,
+        T_world_camera: Matrix,
+        origin: PoseOrigin,
+        ip: str | None,
+        quality: PoseQuality | None = None,
+    ) -> int:
         """A camera's pose is known, by whatever means; returns its version. `ip` is the caller's, if it is a unit.
 
         Raises:
@@ -206,6 +214,7 @@ class Master:
         """
         slot = self.registry.get(unit_id) if ip is None else self.registry.own(unit_id, ip)
         self.registry.set_pose(slot, matrix_of(validated(T_world_camera, "T_world_camera")), origin)
+        slot.pose_quality = quality or PoseQuality()
         self._withdraw(slot.id)
         self._changed()
         logger.info("unit %d (%s): its pose is set (%s)", slot.id, slot.ip, origin, extra=slot.log_fields("pose"))

@@ -27,6 +27,7 @@ from shared.messages import (
     Matrix,
     Outcome,
     PoseOrigin,
+    PoseQuality,
     State,
     UnitRow,
     Verb,
@@ -92,6 +93,7 @@ class Slot:
     versions: Versions = field(default_factory=Versions)
     keys: NDArray[np.uint32] = field(default_factory=lambda: NO_KEYS)
     health: Health = field(default_factory=Health)
+    pose_quality: PoseQuality = field(default_factory=PoseQuality)
     told_pose: Matrix | None = None
     warning: str = ""
     asked: deque[_Asked] = field(default_factory=deque)
@@ -112,6 +114,7 @@ class Slot:
         """What is kept of it is this from now on; with another pose, what it reported is void."""
         if record.pose_version != self.record.pose_version:
             self.keys = NO_KEYS
+            self.pose_quality = PoseQuality()
         self.record = record
         # Each update asks for these.
         self.id, self.ip = record.id, record.ip
@@ -223,7 +226,7 @@ class Slot:
         `current` has the versions of the master; its pose counts for nothing, each slot has its own.
         """
         if self.T_world_camera is None:
-            return "uncalibrated", self.record.note or "its pose is not known yet"
+            return "uncalibrated", self.record.note or self.health.trouble or "its pose is not known yet"
         if stale := self._stale(now_ns, current, settings):
             trouble = f" ({self.health.trouble})" if self.health.trouble else ""
             return "stale", stale + trouble
@@ -265,6 +268,7 @@ class Slot:
             health=self.health,
             T_world_camera=self.T_world_camera,
             pose_origin=self.record.pose_origin,
+            pose_quality=self.pose_quality,
             versions=self.versions,
             last_command=self.last_command,
         )

@@ -271,11 +271,20 @@ class UpdateAnswer(Message):
     T_world_camera: Matrix | None = None
 
 
+class PoseQuality(Message):
+    """How well a camera's pose is known by what it was found by; what was not measured is absent."""
+
+    uncertainty_mm: float | None = Field(default=None, ge=0.0, description="Standard error of its position.")
+    uncertainty_deg: float | None = Field(default=None, ge=0.0, description="Standard error of its rotation.")
+    reprojection_px: float | None = Field(default=None, ge=0.0, description="RMS, where it was found by the board.")
+
+
 class PoseRequest(Message):
     """Where a unit's camera is: `T_world_camera` (4, 4), optical frame."""
 
     T_world_camera: Matrix
     origin: PoseOrigin = "operator"
+    quality: PoseQuality = PoseQuality()
 
     @field_validator("T_world_camera")
     @classmethod
@@ -337,6 +346,7 @@ class UnitRow(Message):
     health: Health
     T_world_camera: Matrix | None
     pose_origin: PoseOrigin | None = Field(default=None, description="Who said where the camera is.")
+    pose_quality: PoseQuality = PoseQuality()
     versions: Versions
     last_command: CommandRow | None = None
 

@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.board_layout import BoardLayout
+from edge_unit.sources.image import ImageStream
 from shared.camera import Intrinsics
-from shared.transforms import Transform, apply, inverse
+from shared.transforms import Transform, apply, from_xyz_rpy, identity, inverse
+from simulation.raster import RasterRenderer
+from simulation.world import World
 
 TEXTURE_PX_PER_M = 8000.0
 TEXTURE_MAX_PX = 6000
@@ -19,6 +22,9 @@ TEXTURE_MAX_PX = 6000
 
 SUPERSAMPLING = 4
 """Rays along each side of a pixel."""
+
+THICKNESS_M = 0.005
+"""A board lies on a surface; what is nearer by this much hides it."""
 
 MARGIN_SQUARES = 0.5
 """White paper about the pattern."""
@@ -121,3 +127,46 @@ def _covered(low: float, high: float) -> tuple[slice, NDArray[np.float32]]:
     edges = np.arange(first, last + 1)
     covered = np.diff(np.clip(edges, low, high)).astype(np.float32)
     return slice(first, last), covered
+
+
+class BoardCamera:
+    """An image stream of a depth camera that hangs still in a world with a board, its emitter off."""
+
+    def __init__(self, world: World, T_world_depth: Transform, stream: ImageStream, seed: int) -> None:
+        """A cell without a board is a grey picture."""
+        focal_px, T_depth_image = _STREAMS[stream]
+        self.stream: ImageStream = stream
+        self.T_depth_image = T_depth_image
+        self.intrinsics = Intrinsics(1280, 720, focal_px, focal_px, 639.5, 359.5)
+        self._world = world
+        self._rng = np.random.default_rng((seed, 0xB0A4))
+        T_world_image = T_world_depth @ T_depth_image
+        self._renderer = RasterRenderer(self.intrinsics, T_world_image)
+        board = world.cell.board
+        self._picture = None if board is None else BoardPicture(BoardLayout.of(board), self.intrinsics)
+        self._T_image_board = None if board is None else inverse(T_world_image) @ board.T_world_board
+
+    def take(self, t_s: float) -> NDArray[np.uint8]:
+        """The picture (720, 1280) uint8 taken at `t_s`, RGB for colour; what stands before the board hides it."""
+        picture, T_image_board = self._picture, self._T_image_board
+        if picture is None or T_image_board is None:
+            return np.full(self.intrinsics.shape, round(PictureQuality().surroundings), np.uint8)
+        view = self._renderer.render(self._world.scene(t_s))
+        hidden = view.z_m < _plane_z_m(self.intrinsics, T_image_board) - THICKNESS_M
+        grey = picture.develop(picture.expose(T_image_board, hidden), self._rng)
+        return grey if self.stream == "infrared" else np.repeat(grey[:, :, None], 3, axis=2)
+
+
+def _plane_z_m(camera: Intrinsics, T_image_board: Transform) -> NDArray[np.float64]:
+    """Depth (H, W) at which each pixel's ray meets the board's plane; where it does not, it means nothing."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    normal, origin_m = T_image_board[:3, 2], T_image_board[:3, 3]
+    along = normal[0] * (u - camera.cx) / camera.fx + normal[1] * (v - camera.cy) / camera.fy + normal[2]
+    with np.errstate(divide="ignore"):
+        return np.asarray(normal @ origin_m / along)
+
+
+_STREAMS: dict[ImageStream, tuple[float, Transform]] = {
+    "infrared": (640.0, identity()),
+    "color": (915.0, from_xyz_rpy((0.015, 0.0, 0.0), (0.002, -0.001, 0.003))),
+}

@@ -4,12 +4,12 @@
 First the seam, then what stands behind it:
 
     frame      a frame, a camera's identity, and what every source can do
+    image      a picture that is not depth, for the calibration board
     recorded   a folder of 16-bit PNG images with intrinsics, poses and joints
     simulated  a depth camera in the simulated cell
 
 A RealSense camera is captured by a process of its own, which alone loads the SDK:
 
-    image               a picture that is not depth, for the calibration board
     status              how a source is doing, told without a frame
     profiles            which of the pictures on offer comes nearest
     camera_clock        the camera's time stamps on our clock

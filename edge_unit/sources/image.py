@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,3 +43,33 @@ class ImageFrame:
     pixels: NDArray[np.uint8]
     captured_at_ns: int
     frame_number: int
+
+
+class ImageLook(Protocol):
+    """Pictures of one image stream, while depth pauses."""
+
+    @property
+    def info(self) -> ImageInfo:
+        """The stream's lens, and where it stands."""
+        ...
+
+    def images(self) -> AsyncIterator[ImageFrame]:
+        """Pictures as they come, latest wins.
+
+        Raises:
+            SourceError: the camera will deliver no more.
+        """
+        ...
+
+
+@runtime_checkable
+class LooksAtBoard(Protocol):
+    """A source that can deliver pictures of another stream, the emitter off, for as long as the context lasts."""
+
+    def look(self, stream: ImageStream) -> AbstractAsyncContextManager[ImageLook]:
+        """Pause depth and begin; depth goes on afterwards by itself.
+
+        Raises:
+            SourceError: it is not open, or has no such stream.
+        """
+        ...

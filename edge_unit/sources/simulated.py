@@ -8,8 +8,10 @@ the same people at the same time. Only this source imports the simulation, and o
 from __future__ import annotations
 
 import asyncio
+import itertools
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Literal
 
@@ -17,12 +19,14 @@ import msgpack
 from pydantic import BaseModel, ConfigDict, Field
 
 from edge_unit.sources.frame import CameraInfo, DepthFrame
+from edge_unit.sources.image import ImageFrame, ImageInfo, ImageStream
 from shared.cell import Cell
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, SourceError
 from shared.waiting import within
 
 if TYPE_CHECKING:
+    from simulation.board_picture import BoardCamera
     from simulation.camera import SimulatedCamera, SimulatedFrame
     from simulation.truth import TruthFinder
 
@@ -43,6 +47,7 @@ class SimulatedSourceConfig(BaseModel):
     )
     people: int = Field(default=1, ge=0, le=2, description="How many people walk beside the table.")
     seed: int = Field(default=0, ge=0, le=0xFFFF, description="Decides who walks how, and all noise.")
+    knows_pose: bool = Field(default=True, description="Else it must be told its pose, or find it by the board.")
     cell: Path | None = Field(default=None, description="A cell.yaml with a UR3e; the demo cell when left out.")
     truth_path: Path | None = Field(
         default=None, description="File to which the truth of every frame is appended, for evaluation."
@@ -53,6 +58,30 @@ class SimulatedSourceConfig(BaseModel):
     def serial(self) -> str:
         """The camera's serial number."""
         return f"SIM{self.seed:05d}{self.camera:02d}"
+
+
+class SimulatedLook:
+    """Pictures of the board as the simulated camera takes them; an `ImageLook`."""
+
+    def __init__(self, camera: BoardCamera, worker: ThreadPoolExecutor, epoch_ns: int) -> None:
+        self._camera = camera
+        self._worker = worker
+        self._epoch_ns = epoch_ns
+
+    @property
+    def info(self) -> ImageInfo:
+        """See `ImageLook`."""
+        return ImageInfo(
+            self._camera.stream, self._camera.intrinsics, (0.0,) * 5, "brown_conrady", self._camera.T_depth_image
+        )
+
+    async def images(self) -> AsyncIterator[ImageFrame]:
+        """See `ImageLook`; taken as fast as they are wanted."""
+        loop = asyncio.get_running_loop()
+        for number in itertools.count():
+            now_ns = monotonic_ns()
+            t_s = (now_ns - self._epoch_ns) / NS_PER_S
+            yield ImageFrame(await loop.run_in_executor(self._worker, self._camera.take, t_s), now_ns, number)
 
 
 class SimulatedSource:
@@ -104,6 +133,15 @@ class SimulatedSource:
                 writing = loop.run_in_executor(worker, self._write_truth, due_ns, number, frame)
             yield DepthFrame(frame.depth, due_ns, number)
 
+    @asynccontextmanager
+    async def look(self, stream: ImageStream) -> AsyncIterator[SimulatedLook]:
+        """See `LooksAtBoard`."""
+        worker = self._worker
+        if worker is None:
+            raise SourceError("simulated camera: a look was asked for before it was opened")
+        eye = await asyncio.get_running_loop().run_in_executor(worker, self._board_camera, stream)
+        yield SimulatedLook(eye, worker, self._config.epoch_ns)
+
     async def close(self) -> None:
         """See `DepthSource`."""
         self._closing.set()
@@ -148,7 +186,17 @@ class SimulatedSource:
             except OSError as error:
                 raise SourceError(f"simulated camera: truth_path: {error}") from error
         self._camera = camera
-        return CameraInfo(config.serial, "Simulated D435i", intrinsics, pose)
+        return CameraInfo(config.serial, "Simulated D435i", intrinsics, pose if config.knows_pose else None)
+
+    def _board_camera(self, stream: ImageStream) -> BoardCamera:
+        from simulation.board_picture import BoardCamera
+
+        camera, config = self._camera, self._config
+        assert camera is not None
+        try:
+            return BoardCamera(camera.world, camera.T_world_camera, stream, config.seed * 64 + config.camera)
+        except CellwatchError as error:
+            raise SourceError(f"simulated camera: {error}") from error
 
     def _stop(self) -> None:
         if self._truth_file is not None:

@@ -55,7 +55,7 @@ async def set_pose(
 ) -> PoseAnswer:
     """Where the camera is; a unit may tell only its own."""
     ip = ip_of(request.scope) if role is Role.UNIT else None
-    return PoseAnswer(pose=master.set_pose(unit_id, body.T_world_camera, body.origin, ip))
+    return PoseAnswer(pose=master.set_pose(unit_id, body.T_world_camera, body.origin, ip, body.quality))
 
 
 @router.post("/units/{unit_id}/background", dependencies=OPERATOR_ONLY, status_code=202)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from edge_unit import board_search as board_search_module
 from edge_unit import unit as unit_module
 from edge_unit import uplink as uplink_module
+from edge_unit.board_layout import BoardLayout
 from edge_unit.client import MasterClient
 from edge_unit.config import PoseConfig, UnitConfig
 from edge_unit.sources.frame import CameraInfo, DepthFrame
+from edge_unit.sources.image import ImageFrame, ImageInfo, ImageStream
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from edge_unit.trace import read_trace
 from edge_unit.unit import Unit
@@ -28,9 +32,14 @@ from master_server.app import make_app
 from master_server.master import Master
 from master_server.registry import Slot
 from shared.camera import Intrinsics
+from shared.cell import Board
 from shared.clock import monotonic_ns
 from shared.errors import SourceError
 from shared.messages import DONE, CommandRow, JointsRequest, Outcome, UnitRow, Verb
+from shared.settings import Settings
+from shared.transforms import from_xyz_rpy, inverse
+from simulation.board_picture import BoardPicture
+from tests.master_server.fakes import cell as make_cell
 from tests.master_server.fakes import master as make_master
 
 TOKEN = "unit-token-0123456789"
@@ -472,3 +481,98 @@ async def test_pictures_are_drawn_when_someone_asks(tmp_path: Path) -> None:
         assert cv2.imdecode(np.frombuffer(coloured.content, np.uint8), cv2.IMREAD_UNCHANGED).shape == (48, 64, 3)
         await bench.until_state("live")
         await bench.until(lambda: not bench.master.registry.get(1).asked, "all told")
+
+
+BOARD = Board("grid", 3, 4, 0.08, 0.06, "DICT_4X4_50", 0, from_xyz_rpy((0.4, 1.1, 0.0), (np.pi, 0.0, 0.0)))
+BOARD_CAMERA = Intrinsics(640, 480, 600.0, 600.0, 320.0, 240.0)
+
+
+class LookingSource(FakeSource):
+    """Shows the board, when there is one, as from `ABOVE`; depth waits meanwhile."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        picture = BoardPicture(BoardLayout.of(BOARD), BOARD_CAMERA)
+        seen = picture.expose(inverse(ABOVE.transform()) @ BOARD.T_world_board)
+        self.with_board = picture.develop(seen, np.random.default_rng(0))
+        self.info = ImageInfo("infrared", BOARD_CAMERA, (0.0,) * 5, "brown_conrady", np.eye(4))
+        self.mounted = False
+        self.looks = 0
+
+    @contextlib.asynccontextmanager
+    async def look(self, stream: ImageStream) -> AsyncIterator[LookingSource]:
+        self.looks += 1
+        yield self
+
+    async def images(self) -> AsyncIterator[ImageFrame]:
+        for number in range(100):
+            yield ImageFrame(self.with_board if self.mounted else self.with_board * 0, monotonic_ns(), number)
+
+
+def looking_bench(folder: Path, **config: Any) -> tuple[Bench, LookingSource]:
+    bench = Bench(folder, **{"T_world_camera": None, **config})
+    bench.serve(Master(replace(make_cell(), board=BOARD), Settings(stale_after_s=60.0)))
+    source = LookingSource()
+    bench.source = source
+    bench.unit = bench.make_unit()
+    return bench, source
+
+
+async def test_without_a_pose_it_looks_for_the_board_until_it_is_mounted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(board_search_module, "RETRY_MIN_S", 0.01)
+    bench, source = await asyncio.to_thread(looking_bench, tmp_path)
+    async with bench.running():
+        bench.show(patch(1225))
+        row = await bench.until(lambda: (row := bench.row()) and "none of" in row.reason and row, "its search")
+        assert row.state == "uncalibrated"
+        assert row.reason.startswith("looking for the board: none of the board's 12 markers was seen in")
+        source.mounted = True
+        await asyncio.sleep(0.05)
+        bench.show(patch(1225))
+        row = await bench.until(lambda: (row := bench.row()) and row.T_world_camera and row, "its pose")
+        assert np.abs(np.array(row.T_world_camera) - ABOVE.transform()).max() < 5e-3
+        assert 0.0 < row.pose_quality.uncertainty_mm < 5.0
+        assert 0.0 < row.pose_quality.uncertainty_deg < 0.3
+        assert 0.0 < row.pose_quality.reprojection_px < 0.2
+        await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
+        looks = source.looks
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        assert bench.voxels()
+        assert source.looks == looks
+
+
+async def test_it_looks_for_the_board_when_asked_even_if_it_has_a_pose(tmp_path: Path) -> None:
+    bench, source = await asyncio.to_thread(looking_bench, tmp_path, T_world_camera=BESIDE)
+    source.mounted = True
+    async with bench.running():
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        assert source.looks == 0
+        bench.master.ask(1, "calibrate", monotonic_ns())
+        await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
+        bench.show(patch(1225))
+        row = await bench.until(lambda: (row := bench.row()) and row.last_command.outcome and row, "its outcome")
+        assert row.last_command.outcome == DONE
+        assert np.abs(np.array(row.T_world_camera) - ABOVE.transform()).max() < 5e-3
+        source.mounted = False
+        bench.master.ask(1, "calibrate", monotonic_ns())
+        await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
+        bench.show(patch(1225))
+        row = await bench.until(
+            lambda: (row := bench.row()) and row.last_command.id == 2 and row.last_command.outcome and row, "2"
+        )
+        assert "none of the board's 12 markers" in row.last_command.outcome
+        assert np.abs(np.array(row.T_world_camera) - ABOVE.transform()).max() < 5e-3
+
+
+async def test_it_does_not_look_by_itself_when_told_not_to(tmp_path: Path) -> None:
+    bench, source = await asyncio.to_thread(looking_bench, tmp_path, localise=False)
+    source.mounted = True
+    async with bench.running():
+        for _ in range(2):
+            bench.show(patch(1225))
+        await bench.until(lambda: (row := bench.row()) and row.frame_number == 1, "frames")
+        assert source.looks == 0

@@ -306,6 +306,7 @@ class Unit:
         except CellwatchError as error:
             # It looks for ever, but says so once.
             logger.log(logging.WARNING if first else logging.DEBUG, "%s", error)
+            tell(f"looking for the board: {error}")
             return str(error)
         logger.info(
             "found the board in %d of %d pictures: the pose is known to %.1f mm and %.2f degrees",

@@ -14,7 +14,7 @@ import httpx
 import yaml
 
 from benchmarks.fault_scene import CAMERAS_M, FPS, NEWCOMER, RESIDENTS, T_WORLD_CAMERA, show, write_camera, write_cell
-from benchmarks.fault_watch import SETTLED_S, Observer, Present, good
+from benchmarks.fault_watch import SETTLED_S, Asker, Listener, Observer, Present, good
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError
 from simulation.processes import Child, Processes
@@ -55,7 +55,9 @@ class Site:
     master: Child = field(init=False)
     robot: Child = field(init=False)
     operator: httpx.AsyncClient = field(init=False)
-    observer: Observer = field(init=False)
+    asker: Asker = field(init=False)
+    listener: Listener = field(init=False)
+    watching: list[Observer] = field(init=False, default_factory=list)
     cameras: list[Path] = field(init=False)
     _starts: int = field(init=False, default=0)
     _before: Any = field(init=False, default=None)
@@ -145,12 +147,22 @@ class Site:
         response.raise_for_status()
         since_ns = monotonic_ns()
         self.present = [Present(thing, since_ns) for thing in RESIDENTS]
-        self.observer = Observer(self.port, (*RESIDENTS, NEWCOMER))
-        self.observer.start()
+        things = (*RESIDENTS, NEWCOMER)
+        self.asker, self.listener = Asker(self.port, things), Listener(self.port, things)
+        self.watching = [self.asker, self.listener]
+        for observer in self.watching:
+            observer.start()
         await self.settled(START_S)
-        self.observer.answers.clear()
+        for observer in self.watching:
+            observer.answers.clear()
         self._before = await self.acknowledged()
         await asyncio.sleep(SETTLED_S)
+
+    async def look_away(self) -> None:
+        """Have nobody watch any more; harmless when nobody does."""
+        for observer in self.watching:
+            await asyncio.to_thread(observer.stop)
+        self.watching = []
 
     async def give_poses(self) -> None:
         """Tell the master where each camera stands, as an operator would."""
@@ -184,7 +196,7 @@ class Site:
         began_ns = monotonic_ns()
 
         def look() -> bool:
-            answers = self.observer.answers
+            answers = self.asker.answers
             end_ns = monotonic_ns()
             if end_ns - began_ns < SETTLED_S * NS_PER_S:
                 return False
@@ -192,7 +204,7 @@ class Site:
             return bool(recent) and all(good(answer, names, len(SERIALS)) for answer in recent)
 
         await until(
-            look, "a complete map that tells of all that is there", timeout_s, lambda: f"{self.observer.answers[-1:]}"
+            look, "a complete map that tells of all that is there", timeout_s, lambda: f"{self.asker.answers[-1:]}"
         )
 
     async def acknowledged(self) -> dict[str, Any]:

@@ -7,11 +7,14 @@ import http.client
 import json
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from websockets.exceptions import WebSocketException
+from websockets.sync.client import connect
 
 from benchmarks.fault_scene import FPS, Thing
 from shared.clock import NS_PER_S, monotonic_ns
@@ -30,6 +33,9 @@ RECOVERED_S_MAX = 1.0
 
 SETTLED_S = 0.5
 """Once good, answers must stay so for this long to count as recovered."""
+
+SILENT_S = 1.0
+"""The stream has a heartbeat twice as often."""
 
 TIMEOUT_S = 0.25
 """Who waits longer for an answer has none."""
@@ -60,7 +66,7 @@ class Present:
 
 
 class Observer(threading.Thread):
-    """Asks until told to stop."""
+    """Notes what the map says, until told to stop."""
 
     def __init__(self, port: int, things: Sequence[Thing]) -> None:
         super().__init__(name="observer", daemon=True)
@@ -73,20 +79,6 @@ class Observer(threading.Thread):
         """Stop asking."""
         self._stopped.set()
         self.join()
-
-    def run(self) -> None:
-        """See `threading.Thread`."""
-        connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=TIMEOUT_S)
-        while not self._stopped.wait(POLL_S):
-            try:
-                connection.request("GET", "/voxels?unseen=true")
-                body = connection.getresponse().read()
-                got_ns = monotonic_ns()
-                self.answers.append(self._look(json.loads(body), got_ns))
-            except (OSError, http.client.HTTPException):
-                connection.close()
-                self.answers.append(Answer(monotonic_ns()))
-        connection.close()
 
     def _look(self, view: dict[str, Any], got_ns: int) -> Answer:
         blocks = view["unseen"]
@@ -113,6 +105,38 @@ class Observer(threading.Thread):
             frozenset(held),
             frozenset(free),
         )
+
+
+class Asker(Observer):
+    """Asks GET /voxels every POLL_S."""
+
+    def run(self) -> None:
+        """See `threading.Thread`."""
+        connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=TIMEOUT_S)
+        while not self._stopped.wait(POLL_S):
+            try:
+                connection.request("GET", "/voxels?unseen=true")
+                body = connection.getresponse().read()
+                self.answers.append(self._look(json.loads(body), monotonic_ns()))
+            except (OSError, http.client.HTTPException):
+                connection.close()
+                self.answers.append(Answer(monotonic_ns()))
+        connection.close()
+
+
+class Listener(Observer):
+    """Follows WS /stream; a message counts from its arrival, and silence for SILENT_S as no answer."""
+
+    def run(self) -> None:
+        """See `threading.Thread`."""
+        url = f"ws://127.0.0.1:{self._port}/stream?encoding=json&unseen=true"
+        while not self._stopped.wait(POLL_S):
+            try:
+                with connect(url, proxy=None, compression=None, open_timeout=SILENT_S, close_timeout=POLL_S) as stream:
+                    while not self._stopped.is_set():
+                        self.answers.append(self._look(json.loads(stream.recv(SILENT_S)), monotonic_ns()))
+            except (OSError, TimeoutError, WebSocketException):
+                self.answers.append(Answer(monotonic_ns()))
 
 
 def _grid(shape: Sequence[int], indices: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -177,6 +201,16 @@ def judge(
         wrong,
         sum(during) / max(len(during), 1),
     )
+
+
+def in_force(messages: Sequence[Answer]) -> list[Answer]:
+    """Of a stream: each message when it came, and once more when the next one did, until when it was what counted."""
+    lasting = []
+    for message, following in pairwise(messages):
+        lasting.append(message)
+        if message.now_ns is not None:
+            lasting.append(replace(message, now_ns=following.got_ns))
+    return [*lasting, *messages[-1:]]
 
 
 def good(answer: Answer, names: set[str], units: int) -> bool:

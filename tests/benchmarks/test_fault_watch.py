@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.fault_scene import BOX_MIN_M, NEWCOMER, RESIDENTS
-from benchmarks.fault_watch import Answer, Present, Verdict, judge
+from benchmarks.fault_watch import Answer, Present, Verdict, in_force, judge
 from shared.clock import NS_PER_S
 
 CAUSE_NS, GONE_NS = 10 * NS_PER_S, 13 * NS_PER_S
@@ -87,3 +87,9 @@ def test_only_blocks_that_a_thing_crosses_wholly_count() -> None:
     blocks = NEWCOMER.blocks(np.array(BOX_MIN_M), 0.1)
     assert len(blocks) >= 4
     assert set(blocks[:, 1]) == {2}
+
+
+def test_a_message_of_a_stream_counts_until_the_next() -> None:
+    late = (at(9.9, GOOD), at(11.0, STALE), at(13.3, BACK))
+    assert verdict(*late).false_free == ""
+    assert "free although" in verdict(*in_force(late)).false_free

@@ -327,6 +327,8 @@ class Registry:
         two cameras of one serial would otherwise evict each other for ever, as would two cameras behind one IP. Its
         pose moves along only within one boot of the unit, for then merely the address changed. Another camera in a
         slot voids the pose. A pose that the unit was told replaces none but one that a unit was told before.
+        Where a camera takes the slot of another, that one is expected in its old slot instead of being forgotten:
+        units that exchanged addresses come one after the other, and one that does not come back must be missed.
 
         Raises:
             Refusal: 409, the camera reports from another IP right now, or another camera from this one; 503, there
@@ -346,9 +348,12 @@ class Registry:
         if slot is None and len(self) - len(elsewhere) >= MAX_UNITS:
             raise Refusal(503, f"no free slot: expected at most {MAX_UNITS} units; delete one that is gone")
         record = _registered(request, ip, self._last_id + 1 if slot is None else slot.record, elsewhere)
+        moved = elsewhere[:1] if slot is not None and slot.serial != request.serial else []
+        retired = elsewhere[len(moved) :]
+        left = [_expecting(old.record, slot.record, ip) for old in moved if slot is not None]
         if slot is None or elsewhere or record != slot.record:
             try:
-                self._store.save_units([record], [old.id for old in elsewhere])
+                self._store.save_units([record, *left], [old.id for old in retired])
             except Refusal:
                 if slot is None or elsewhere or record.pose_version != slot.pose_version:
                     raise
@@ -358,7 +363,11 @@ class Registry:
             logger.warning(
                 "unit %d (%s): camera %s is at %s now", old.id, old.ip, old.serial, ip, extra=old.log_fields("camera")
             )
+        for old in retired:
             self._drop(old)
+        for old, expecting in zip(moved, left, strict=True):
+            old.become(expecting)
+            old.begin_session(None)
         if slot is None:
             self._last_id = record.id
             slot = self._slots[record.id] = self._by_ip[ip] = Slot(record)
@@ -465,6 +474,14 @@ def _registered(request: InitializeRequest, ip: str, before: UnitRecord | int, e
             "software": request.software,
             "boot_id": request.boot_id,
         }
+    )
+
+
+def _expecting(left: UnitRecord, taken: UnitRecord, ip: str) -> UnitRecord:
+    """The slot that a camera left for `ip`: the one that was there is expected here, without a pose."""
+    note = f"camera {left.serial} is at {ip} now, where camera {taken.serial} was, which did not come back yet"
+    return left.posed(None, None, note).model_copy(
+        update={"serial": taken.serial, "model": taken.model, "software": "", "boot_id": ""}
     )
 
 

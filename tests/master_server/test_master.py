@@ -97,6 +97,33 @@ def test_a_camera_at_a_new_ip_retires_its_old_slot() -> None:
     assert shown(one) == {}
 
 
+def test_a_camera_whose_address_another_took_is_missed_until_it_is_back() -> None:
+    one = master()
+    live(one, 1, 5)
+    live(one, 2, 6)
+    first = FakeUnit(one, ip="10.0.0.2", serial="S1", boot_id="another boot")
+    first.initialize(LATER_NS)
+    first.update(LATER_NS + MS, [7])
+    assert shown(one, LATER_NS + MS) == {7: 1}
+    reason = one.view(LATER_NS + MS).reasons[0]
+    assert reason.startswith("unit 1 (10.0.0.1) is uncalibrated: camera S1 is at 10.0.0.2 now, where camera S2 was")
+    second = FakeUnit(one, ip="10.0.0.1", serial="S2", boot_id="another boot")
+    assert second.initialize(LATER_NS + 2 * MS, pose=None).T_world_camera is None
+    second.initialize(LATER_NS + 3 * MS)
+    second.update(LATER_NS + 4 * MS, [8])
+    assert [(row.ip, row.serial) for row in one.units(LATER_NS)] == [("10.0.0.1", "S2"), ("10.0.0.2", "S1")]
+    assert shown(one, LATER_NS + 4 * MS) == {7: 1, 8: 1}
+
+
+def test_a_camera_that_does_not_come_back_may_be_deleted_or_come_elsewhere() -> None:
+    one = master()
+    live(one, 1, 5)
+    live(one, 2, 6)
+    FakeUnit(one, ip="10.0.0.2", serial="S1", boot_id="another boot").initialize(LATER_NS)
+    FakeUnit(one, ip="10.0.0.9", serial="S2", boot_id="another boot").initialize(LATER_NS)
+    assert [(row.ip, row.serial) for row in one.units(LATER_NS)] == [("10.0.0.2", "S1"), ("10.0.0.9", "S2")]
+
+
 def test_a_new_address_within_one_boot_keeps_the_pose() -> None:
     one = master()
     live(one, 1, 5)

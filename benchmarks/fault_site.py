@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -140,8 +140,7 @@ class Site:
         Raises:
             FaultError: it does not become so.
         """
-        for _ in SERIALS:
-            await until(lambda: all(registered(unit) for unit in self.units), "two registered units")
+        await until(lambda: all(registered(unit) for unit in self.units), "two registered units")
         await self.give_poses()
         response = await self.operator.put("/settings", json=SETTING)
         response.raise_for_status()
@@ -254,6 +253,3 @@ async def until(
         if monotonic_ns() > deadline_ns:
             raise FaultError(f"{what}: not within {timeout_s:g} s; {last()}")
         await asyncio.sleep(LOOK_S)
-
-
-Act = Callable[[Site], Awaitable[None]]

@@ -89,7 +89,7 @@ async def ordinary(site: Site) -> None:
     await site.calm()
 
 
-def begin(site: Site, course: Course) -> None:
+def begin(course: Course) -> None:
     """Now it strikes."""
     course.cause_ns = monotonic_ns()
 
@@ -107,8 +107,9 @@ async def again(site: Site, course: Course, **how: Any) -> None:
 
 
 async def unit_killed(site: Site, course: Course) -> None:
+    """A unit is killed while something comes before it."""
     await ordinary(site)
-    begin(site, course)
+    begin(course)
     await site.kill(site.units[FIRST])
     site.newcomer()
     await hold(0.0)
@@ -117,8 +118,9 @@ async def unit_killed(site: Site, course: Course) -> None:
 
 
 async def unit_frozen(site: Site, course: Course) -> None:
+    """A unit stands still, and must not show afterwards what it had in hand."""
     await ordinary(site)
-    begin(site, course)
+    begin(course)
     site.units[FIRST].process.send_signal(signal.SIGSTOP)
     site.newcomer()
     await hold()
@@ -128,8 +130,9 @@ async def unit_frozen(site: Site, course: Course) -> None:
 
 
 async def robot_silent(site: Site, course: Course) -> None:
+    """The robot's controller stands still."""
     await ordinary(site)
-    begin(site, course)
+    begin(course)
     site.robot.process.send_signal(signal.SIGSTOP)
     site.newcomer()
     await hold()
@@ -139,8 +142,9 @@ async def robot_silent(site: Site, course: Course) -> None:
 
 
 async def master_killed(site: Site, course: Course) -> None:
+    """The master is killed, and comes back at the same port."""
     await ordinary(site)
-    begin(site, course)
+    begin(course)
     await site.kill(site.master)
     site.newcomer()
     await hold()
@@ -152,7 +156,7 @@ async def master_killed(site: Site, course: Course) -> None:
 async def camera_died_meanwhile(site: Site, course: Course) -> None:
     """The master is killed, and while nobody asks, so is a unit."""
     await ordinary(site)
-    begin(site, course)
+    begin(course)
     await site.kill(site.master)
     await site.kill(site.units[FIRST])
     site.newcomer()
@@ -177,7 +181,7 @@ def wall_clock(index: int | None, by_s: int) -> Callable[[Site, Course], Awaitab
         for each in (FIRST, SECOND):
             await site.start_unit(each, variables=clock.environment if each == index else None)
         await site.calm()
-        begin(site, course)
+        begin(course)
         clock.jump(by_s)
         site.newcomer()
         course.gone_ns = course.cause_ns
@@ -192,7 +196,7 @@ def monotonic_clock(by_s: int) -> Callable[[Site, Course], Awaitable[None]]:
 
     async def strike(site: Site, course: Course) -> None:
         await ordinary(site)
-        begin(site, course)
+        begin(course)
         await site.kill(site.units[FIRST])
         site.newcomer()
         await hold(0.0)
@@ -206,6 +210,7 @@ def monotonic_clock(by_s: int) -> Callable[[Site, Course], Awaitable[None]]:
 
 
 async def network_cut(site: Site, course: Course) -> None:
+    """A unit in a network namespace of its own loses its cable."""
     cable = Cable()
     try:
         site.host = "0.0.0.0"
@@ -214,7 +219,7 @@ async def network_cut(site: Site, course: Course) -> None:
         await site.start_unit(FIRST, f"http://10.77.0.1:{site.port}", UNIT_IP, cable.under)
         await site.start_unit(SECOND)
         await site.calm()
-        begin(site, course)
+        begin(course)
         cable.pull()
         site.newcomer()
         await hold(2.0 * HOLD_S)
@@ -241,7 +246,7 @@ async def network_slow(site: Site, course: Course) -> None:
     """What it sends is 150 to 250 ms under way."""
     proxy = await by_proxy(site)
     try:
-        begin(site, course)
+        begin(course)
         proxy.delay_s, proxy.jitter_s = 0.2, 0.05
         site.newcomer()
         await hold(2.0 * HOLD_S)
@@ -258,7 +263,7 @@ async def connections_cut(site: Site, course: Course) -> None:
     """Every connection of a unit is reset, three times a second."""
     proxy = await by_proxy(site)
     try:
-        begin(site, course)
+        begin(course)
         site.newcomer()
         for _ in range(10):
             proxy.cut()
@@ -281,7 +286,7 @@ def replayed(path: str) -> Callable[[Site, Course], Awaitable[None]]:
                 raise FaultError(f"no POST {path} was recorded")
             site.newcomer()
             await site.settled()
-            begin(site, course)
+            begin(course)
             answer = await send_again(requests[-1], site.port)
             course.gone_ns = monotonic_ns()
             course.figures["answered"] = answer
@@ -332,7 +337,7 @@ async def master_disk_full(site: Site, course: Course) -> None:
     disk = tmpfs(site.master_state)
     try:
         await ordinary(site)
-        begin(site, course)
+        begin(course)
         full = fill(disk)
         site.newcomer()
         response = await site.operator.put("/settings", json={"margin_base_m": 0.032})
@@ -358,7 +363,7 @@ async def unit_disk_full(site: Site, course: Course) -> None:
     try:
         fill(disk)
         await ordinary(site)
-        begin(site, course)
+        begin(course)
         await site.kill(site.units[FIRST])
         site.newcomer()
         await hold(0.0)
@@ -374,7 +379,7 @@ async def unit_disk_full(site: Site, course: Course) -> None:
 async def units_swapped(site: Site, course: Course) -> None:
     """Both units are started again with each other's address; then an operator tells where the cameras are."""
     await ordinary(site)
-    begin(site, course)
+    begin(course)
     for unit in site.units:
         await site.kill(unit)
     site.newcomer()
@@ -395,7 +400,7 @@ async def units_swapped(site: Site, course: Course) -> None:
 async def address_taken(site: Site, course: Course) -> None:
     """The first unit comes back with the address of the second, which is gone for now; an operator tells its pose."""
     await ordinary(site)
-    begin(site, course)
+    begin(course)
     for unit in site.units:
         await site.kill(unit)
     site.newcomer()
@@ -419,7 +424,7 @@ async def token_revoked(site: Site, course: Course) -> None:
     await ordinary(site)
     token = "another-token-of-the-units-0123456789abcdef"
     replace(site.tokens[SECOND], token)
-    begin(site, course)
+    begin(course)
     replace(site.unit_token, token)
     site.newcomer()
     await hold()
@@ -573,7 +578,9 @@ def text(rows: Sequence[dict[str, Any]]) -> str:
         )
         for each in rows
     ]
-    return "\n".join(("Faults, with real processes", *table(columns, cells), *REMARKS))
+    started = ", ".join(f"{each['name']} {each['process_start_s']:.3f}" for each in rows if "process_start_s" in each)
+    starts = (f"From the start of a unit's process until it registered, s: {started}.",) if started else ()
+    return "\n".join(("Faults, with real processes", *table(columns, cells), *REMARKS, *starts))
 
 
 REMARKS = (

@@ -158,13 +158,17 @@ class Uplink:
         await self._client.put_image(self._id, command.image, command.id, png)
 
     async def tell_pose(self, T_world_camera: Transform, origin: str, quality: PoseQuality) -> None:
-        """This unit's camera was found to be there; it comes back with the answer to an update, as every pose.
+        """This unit's camera was found to be there; the next frame is processed with it.
 
         Raises:
             UplinkError: the master did not hear of it, or refused it.
             WireError: its answer is none of ours.
         """
-        await self._client.put_pose(self._id, T_world_camera, origin, quality)
+        assignment = self.assignment
+        version = await self._client.put_pose(self._id, T_world_camera, origin, quality)
+        if assignment is not None and self.assignment is not None and self.assignment.session == assignment.session:
+            versions = self.assignment.versions.model_copy(update={"pose": version})
+            self._assign(replace(self.assignment, versions=versions, T_world_camera=T_world_camera))
 
     async def drained(self, timeout_s: float) -> None:
         """Wait until nothing is left to be sent, but no longer than `timeout_s`."""

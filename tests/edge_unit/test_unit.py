@@ -536,7 +536,6 @@ async def test_without_a_pose_it_looks_for_the_board_until_it_is_mounted(
         assert 0.0 < row.pose_quality.uncertainty_mm < 5.0
         assert 0.0 < row.pose_quality.uncertainty_deg < 0.3
         assert 0.0 < row.pose_quality.reprojection_px < 0.2
-        await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
         looks = source.looks
         bench.show(patch(1225))
         await bench.until_state("live")

@@ -155,7 +155,7 @@ class Verdict:
     false_free: str
     """The first answer that called free what was not, in words; empty when there is none."""
     complete_share: float
-    """Of the answers between the cause and its end."""
+    """Of the answers between the cause and its end; where there is nothing to notice, of all behind the cause."""
 
 
 def judge(
@@ -193,7 +193,9 @@ def judge(
             wrong = f"{at} complete while nobody could know"
         if wrong:
             break
-    during = [answer.complete for answer in answers if cause_ns <= answer.got_ns < gone_ns]
+    # What nobody has to notice may be over at once, and its consequences come later.
+    end_ns = gone_ns if names is not None else answers[-1].got_ns + 1
+    during = [answer.complete for answer in answers if cause_ns <= answer.got_ns < end_ns]
     return Verdict(
         None if noticed is None else (noticed.got_ns - noticeable_ns) / NS_PER_S,
         _recovered_s(answers, {present.thing.name for present in things}, gone_ns, units),

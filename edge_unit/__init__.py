@@ -37,6 +37,7 @@ In the order of the flow:
     stance          does the camera still stand where its pose was found
     camera_memory   the camera that was here, so that its absence can be told
     trace           what was reported, frame by frame, in a file
+    progress        whether the work on frames makes progress
     config          the unit's own configuration
     unit            the daemon: source, pipeline and uplink held together
     board           what the board itself tells: its clock, its USB

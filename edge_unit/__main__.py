@@ -12,14 +12,19 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from edge_unit.config import ENVIRONMENT_PREFIX, UnitConfig
 from edge_unit.jit_cache import settle
 from edge_unit.sources.recorded import RecordedSourceConfig
 from shared.configuration import assignments, load
 from shared.errors import CellwatchError
+from shared.service import ServiceManager
+
+if TYPE_CHECKING:
+    from edge_unit.unit import Unit
 
 logger = logging.getLogger("edge_unit")
 
@@ -47,7 +52,7 @@ def _run(options: argparse.Namespace) -> int:
     # Imported only now, for kernels settle where they are kept when they are imported.
     from edge_unit.unit import Unit, make_source
 
-    asyncio.run(_until_told_to_stop(Unit(config, make_source(config.source)).run()))
+    asyncio.run(_until_told_to_stop(Unit(config, make_source(config.source))))
     return 0
 
 
@@ -93,16 +98,26 @@ def _board(options: argparse.Namespace) -> int:
     return 0
 
 
-async def _until_told_to_stop(work: Coroutine[None, None, None]) -> None:
-    """Run to the end, or to a signal."""
-    task = asyncio.ensure_future(work)
-    loop = asyncio.get_running_loop()
+async def _until_told_to_stop(unit: Unit) -> None:
+    """Run to the end, or to a signal, and keep the service manager informed."""
+    task = asyncio.ensure_future(unit.run())
+    manager = ServiceManager()
+
+    def stop() -> None:
+        manager.stopping()
+        task.cancel()
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, task.cancel)
+        asyncio.get_running_loop().add_signal_handler(number, stop)
+    # Ready for whatever comes; a camera and a master may come later.
+    manager.ready(unit.status())
+    informing = asyncio.ensure_future(manager.follow(unit.status, unit.stuck))
     try:
         await task
     except asyncio.CancelledError:
         logger.info("stopped")
+    finally:
+        informing.cancel()
 
 
 def _parser() -> argparse.ArgumentParser:

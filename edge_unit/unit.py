@@ -30,6 +30,7 @@ from edge_unit.config import SourceConfig, UnitConfig
 from edge_unit.joints import JointEstimate
 from edge_unit.pictures import picture_raw, png_of
 from edge_unit.pipeline import EXACT, DepthPipeline
+from edge_unit.progress import Progress
 from edge_unit.reference import ReferenceLearner
 from edge_unit.rehearsal import rehearse
 from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
@@ -58,6 +59,12 @@ REOPEN_MAX_S = 5.0
 
 REHEARSAL_S = 5.0
 """For kernels to be read from disk, on a busy machine."""
+
+FRAME_S_MAX = 5.0
+"""For one frame, where nothing has to be prepared: a hundred times what the slowest board takes."""
+
+PREPARE_S_MAX = 240.0
+"""For kernels to be compiled and a cell to be drawn anew on a board that has just begun to do both."""
 
 DRAIN_S = 2.0
 """For the last frame of a recording to reach the master."""
@@ -112,6 +119,9 @@ class Unit:
         self._next_at_ns = 0
         self._sending: set[asyncio.Task[None]] = set()
         self._trouble: str | None = "no frame yet"
+        self._progress = Progress()
+        self._taken = 0
+        self._told = 0, monotonic_ns()
         self.uplink = Uplink(
             self._client,
             CellCache(config.state_dir / "cell"),
@@ -142,6 +152,21 @@ class Unit:
             for result in results:
                 if isinstance(result, Exception):
                     raise result
+
+    # ------------------------------------------------------------------ how it goes
+
+    def status(self) -> str:
+        """One line for a person: camera, frames a second since it was asked last, master."""
+        taken, now_ns = self._taken, monotonic_ns()
+        (before, since_ns), self._told = self._told, (taken, now_ns)
+        trouble = self.uplink.trouble or self._trouble
+        if trouble is None:
+            trouble = f"live, {(taken - before) * NS_PER_S / max(now_ns - since_ns, 1):.1f} fps"
+        return f"{trouble}; {self.uplink.standing}"
+
+    def stuck(self) -> str | None:
+        """What hangs and will not come to its end by itself; waiting for a camera or a master is not of that kind."""
+        return self._progress.stuck(monotonic_ns())
 
     # ------------------------------------------------------------------ frames
 
@@ -180,7 +205,7 @@ class Unit:
 
     async def _open(self) -> None:
         if self._rehearsal is None:
-            self._rehearsal = asyncio.create_task(asyncio.to_thread(rehearse))
+            self._rehearsal = asyncio.create_task(asyncio.to_thread(self._rehearse))
         camera = await self._source.open()
         # Who registers is live with the next frame; but a unit that has to compile first tells that it is there.
         await asyncio.wait((self._rehearsal,), timeout=REHEARSAL_S)
@@ -196,7 +221,7 @@ class Unit:
         if assignment is not None and assignment.T_world_camera is not None:
             # Before the camera delivers, so that no frame has to wait for what is compiled and drawn only once.
             # What cannot be prepared is told with each frame, for the master may change it.
-            with contextlib.suppress(InputError):
+            with contextlib.suppress(InputError), self._progress.working("preparing for frames", PREPARE_S_MAX):
                 await asyncio.to_thread(self._prepared, assignment, assignment.T_world_camera)
 
     async def _register_without_camera(self) -> None:
@@ -246,18 +271,26 @@ class Unit:
                     self.uplink.finish(command, CANNOT.get(command.verb, NO_POSE))
             searching = f"looking for the board: {self._search.outcome}"[:MAX_TEXT] if self._search.outcome else None
             health = Health(frame=frame.frame_number, trouble=searching)
+            self._trouble = searching or NO_POSE
             self.uplink.offer(Report(assignment, frame.captured_at_ns, health=health))
             await self._show(commands, frame, None)
             if self._localises(assignment) and self._search.due(monotonic_ns()):
                 await self._localise(assignment, frame)
             return
         joints = await self._joints_at(assignment, frame)
-        report = await asyncio.to_thread(self._process, assignment, assignment.T_world_camera, frame, joints, commands)
+        pose = assignment.T_world_camera
+        with self._progress.working(f"frame {frame.frame_number}", self._limit_s(assignment, commands)):
+            report = await asyncio.to_thread(self._process, assignment, pose, frame, joints, commands)
+        self._taken += 1
         if (report.health.trouble is None) != (self._trouble is None):
             logger.info("%s", report.health.trouble or "frames are filtered and reported")
         self._trouble = report.health.trouble
         self.uplink.offer(report)
         await self._show(commands, frame, joints)
+
+    def _limit_s(self, assignment: Assignment, commands: list[Command]) -> float:
+        """How long a frame may take: longer where the cell is drawn anew for it, or something was asked for."""
+        return FRAME_S_MAX if assignment is self._applied and not commands else PREPARE_S_MAX
 
     async def _show(self, commands: list[Command], frame: DepthFrame, joints: JointEstimate | None) -> None:
         """Draw the pictures that were asked for; they are encoded and sent while the next frame is taken."""
@@ -339,6 +372,10 @@ class Unit:
         return commands
 
     # ------------------------------------------------------------------ in the thread
+
+    def _rehearse(self) -> None:
+        with self._progress.working("compiling the kernels", PREPARE_S_MAX):
+            rehearse()
 
     def _picture(self, kind: ImageKind, frame: DepthFrame, joints: JointEstimate | None) -> NDArray[np.uint16]:
         """A picture of the frame that was processed last."""

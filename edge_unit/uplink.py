@@ -170,6 +170,15 @@ class Uplink:
             versions = self.assignment.versions.model_copy(update={"pose": version})
             self._assign(replace(self.assignment, versions=versions, T_world_camera=T_world_camera))
 
+    @property
+    def standing(self) -> str:
+        """How it stands with the master, in words for a person."""
+        if self._complaint:
+            return f"no master: {self._complaint}"
+        if self.assignment is None:
+            return f"not registered yet at {self._client.url}"
+        return f"unit {self._id} at {self._client.url}"
+
     async def drained(self, timeout_s: float) -> None:
         """Wait until nothing is left to be sent, but no longer than `timeout_s`."""
         if not await within(timeout_s, self._idle.wait()):
@@ -196,10 +205,9 @@ class Uplink:
                 assignment = self.assignment
                 if assignment is None:
                     await self._register()
-                    retry_s = RETRY_MIN_S
-                    continue
-                await self._report(assignment)
-                retry_s = RETRY_MIN_S
+                else:
+                    await self._report(assignment)
+                retry_s, self._complaint = RETRY_MIN_S, ""
             except MasterRefused as error:
                 if error.status in START_OVER and self.assignment is not None:
                     self._start_over()

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import contextlib
 import gc
 import json
@@ -29,14 +30,17 @@ from master_server.connections import Acceptor, GuardedHttp, fingerprint, quiet,
 from master_server.limits import Limits
 from master_server.logs import LogFormat, LogLevel, configure
 from master_server.master import Master
+from master_server.readable import Readable
 from master_server.recorded import Progress, Recording, summary
 from master_server.recording import Recorder
 from master_server.replay import Replay
 from master_server.store import FILE_NAME, Store
 from master_server.websocket import SERVER_OPTIONS
 from shared.cell import Cell
+from shared.clock import monotonic_ns
 from shared.configuration import assignments, load
 from shared.errors import CellwatchError, ConfigError
+from shared.service import ServiceManager
 
 logger = logging.getLogger("master_server")
 
@@ -84,12 +88,16 @@ class _Server(uvicorn.Server):
         ready: dict[str, Any],
         ready_file: Path | None,
         host: str,
+        status: Callable[[], str],
     ) -> None:
         super().__init__(config)
         self._acceptor = Acceptor(listener, limits, self._protocol, tls)
         self._everywhere = f" and all other addresses of {socket.gethostname()}" if host in ANY_ADDRESS else ""
         self._ready = ready
         self._ready_file = ready_file
+        self._status = status
+        self._manager = ServiceManager()
+        self._informing: asyncio.Task[None] | None = None
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
@@ -105,8 +113,14 @@ class _Server(uvicorn.Server):
         for role in Role:
             lies_in = self._ready[f"{role.value}_token_file"]
             print(f"master-server: the token of the {role.value} lies in {lies_in}", flush=True)
+        self._manager.ready(self._status())
+        if self._manager.listens:
+            self._informing = asyncio.create_task(self._manager.follow(self._status))
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._manager.stopping()
+        if self._informing is not None:
+            self._informing.cancel()
         self._acceptor.close()
         await super().shutdown(sockets)
 
@@ -190,6 +204,7 @@ def _serve(config: ServerConfig, make: Callable[[Access, Limits], Application]) 
         ready,
         config.ready_file,
         config.host,
+        lambda: _status(app.state.master, ready["url"]),
     )
     # Once it has stopped in good order, the server raises the signal that it got again.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -200,6 +215,12 @@ def _serve(config: ServerConfig, make: Callable[[Access, Limits], Application]) 
         listener.close()
         if config.ready_file is not None:
             config.ready_file.unlink(missing_ok=True)
+
+
+def _status(master: Readable, url: str) -> str:
+    """One line for a person: how many units are live, and where the master listens."""
+    states = [unit["state"] for unit in master.unit_states(monotonic_ns())]
+    return f"{states.count('live')} of {len(states)} units live; at {url}"
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -7,6 +7,7 @@ In the order of the flow:
     configuration  YAML, environment and command line as one configuration
     clock          the only place that reads the time
     waiting        waiting with a limit, without losing a cancellation
+    service        what the service manager that started this process is told
     transforms     rigid transforms `T_a_b` as (4, 4) matrices
     camera         pinhole intrinsics of a depth camera
     lattice        the voxel grid that the whole cell shares

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import threading
 from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
 from pathlib import Path
@@ -191,6 +192,31 @@ async def test_of_too_many_voxels_the_nearest_are_reported_and_the_rest_is_not_s
         for x, y, z in everything - near:
             assert seen[x // 2, y // 2, z // 2] == 0
         assert bench.master.view(monotonic_ns()).complete
+
+
+async def test_a_frame_that_hangs_is_told_and_waiting_for_a_camera_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path)
+    release = threading.Event()
+    async with bench.running():
+        bench.show(patch(1225))
+        await bench.until_state("live")
+        assert "live" in bench.unit.status()
+        assert "unit 1 at http://master" in bench.unit.status()
+        bench.show(SourceError("it was unplugged"))
+        await bench.until(lambda: "it was unplugged" in bench.unit.status(), "a camera that is gone")
+        monkeypatch.setattr(unit_module, "FRAME_S_MAX", 0.05)
+        await asyncio.sleep(0.1)
+        assert bench.unit.stuck() is None
+        await bench.until(lambda: bench.source.opened >= 2, "a camera that is opened again")
+        bench.show(patch(1225))
+        await bench.until(lambda: (row := bench.row()) and row.health.frame == 1, "a frame")
+        monkeypatch.setattr(Unit, "_process", lambda *_: release.wait(30.0))
+        bench.show(patch(1225))
+        stuck = await bench.until(bench.unit.stuck, "a frame that hangs")
+        assert stuck.startswith("frame 2 has not come to its end for 0 s")
+        release.set()
 
 
 async def test_what_is_seen_goes_along_only_when_it_changed(tmp_path: Path) -> None:

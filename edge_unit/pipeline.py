@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -17,7 +17,7 @@ from edge_unit.kernels import foreground, limits
 from edge_unit.links import Links
 from edge_unit.misfit import Misfit, MisfitCheck
 from edge_unit.reference import Reference, ReferenceLearner
-from edge_unit.refine import Refinement, Refiner, median_depth_m
+from edge_unit.refine import Refiner
 from edge_unit.visibility import SeenBlocks, Visibility
 from edge_unit.voxels import Voxelizer, Voxels
 from shared.camera import Intrinsics
@@ -231,16 +231,9 @@ class DepthPipeline:
         bare[self._robot.near_raw < limits.RAW_MAX] = 0
         return bare
 
-    def refine(self, frames: Sequence[NDArray[np.uint16]]) -> Refinement:
-        """Find a better pose by the CAD that `frames` of `without_robot` show; `move` makes it count.
-
-        Raises:
-            InputError: there was no frame, or one has the wrong type or shape.
-        """
-        if not frames:
-            raise InputError("refine: expected at least one frame")
-        depth_m = median_depth_m([self.intrinsics.check_depth(each) for each in frames], self.intrinsics.depth_scale_m)
-        return Refiner(self.intrinsics, self.T_world_camera, self._cad_depth_m(), self._noise_per_m).refine(depth_m)
+    def refiner(self) -> Refiner:
+        """Finds a better pose by the CAD, from frames of `without_robot`; `move` makes it count."""
+        return Refiner(self.intrinsics, self.T_world_camera, self._cad_depth_m(), self._noise_per_m)
 
     # ------------------------------------------------------------------ what may change while it runs
 

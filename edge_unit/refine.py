@@ -96,14 +96,21 @@ class Refiner:
         self._obliqueness, self._normals = planes_of(self._expected_m, intrinsics)
         self._noise_per_m = noise_per_m
 
-    def refine(self, depth_m: NDArray[np.float32]) -> Refinement:
-        """Refine by a depth image (H, W) in metres, NaN where nothing was measured or the robot may stand.
+    @property
+    def T_world_camera(self) -> Transform:
+        """The old pose."""
+        return self._T_world_camera
+
+    def refine(self, frames: Sequence[NDArray[np.uint16]]) -> Refinement:
+        """Refine by raw depth images (H, W), 0 where nothing was measured or the robot may stand.
 
         Raises:
-            InputError: its shape is another.
+            InputError: there was no frame, or one has the wrong type or shape.
         """
-        if depth_m.shape != self._intrinsics.shape:
-            raise InputError(f"depth: expected an image of {self._intrinsics.shape}, got {depth_m.shape}")
+        if not frames:
+            raise InputError("refine: expected at least one frame")
+        camera = self._intrinsics
+        depth_m = median_depth_m([camera.check_depth(each) for each in frames], camera.depth_scale_m)
         points_m = self._points(depth_m)
         scale_m = (SCALE_BASE_M + SCALE_NOISE_GAIN * self._noise_per_m * points_m[2] ** 2).astype(np.float32)
         search = _Search(self, points_m, scale_m)

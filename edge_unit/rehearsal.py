@@ -33,3 +33,4 @@ def rehearse() -> None:
         pipeline.process(np.full(CAMERA.shape, DEPTH_MM, np.uint16), np.array([joint_rad]))
     pipeline.health()
     pipeline.seen()
+    pipeline.misfit()

@@ -13,9 +13,10 @@ import contextlib
 import gc
 import importlib.metadata
 import logging
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Coroutine
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ from edge_unit.pictures import picture_raw, png_of
 from edge_unit.pipeline import EXACT, DepthPipeline
 from edge_unit.progress import Progress
 from edge_unit.reference import ReferenceLearner
+from edge_unit.refine import Refiner
 from edge_unit.rehearsal import rehearse
 from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
 from edge_unit.sources.realsense import RealsenseSource, RealsenseSourceConfig
@@ -69,10 +71,8 @@ PREPARE_S_MAX = 240.0
 DRAIN_S = 2.0
 """For the last frame of a recording to reach the master."""
 
-CANNOT = {
-    "refine": "this unit cannot refine its pose by the CAD",
-}
-"""What is asked of units that they are not able to do, in words for the operator."""
+REFINE_FRAMES = 30
+"""Frames whose median a pose is refined by: two seconds at 15 fps, in which people pass by."""
 
 NO_POSE = "the pose of its camera is not known yet"
 
@@ -86,6 +86,15 @@ class _Learning:
     learner: ReferenceLearner
     frames: int
     command: Command | None
+
+
+@dataclass
+class _Refining:
+    """Frames that are gathered for the pose to be refined by."""
+
+    command: Command
+    frames: list[NDArray[np.uint16]]
+    refiner: Refiner
 
 
 class Unit:
@@ -114,10 +123,12 @@ class Unit:
         self._pipeline: DepthPipeline | None = None
         self._applied: Assignment | None = None
         self._learning: _Learning | None = None
+        self._refining: _Refining | None = None
+        self._refined: Transform | None = None
         self._rehearsal: asyncio.Task[None] | None = None
         self._search = BoardSearch(source, config.board_stream)
         self._next_at_ns = 0
-        self._sending: set[asyncio.Task[None]] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
         self._trouble: str | None = "no frame yet"
         self._progress = Progress()
         self._taken = 0
@@ -144,10 +155,10 @@ class Unit:
             try:
                 await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             finally:
-                for task in (*tasks, *self._sending):
+                for task in (*tasks, *self._tasks):
                     task.cancel()
                 results = await asyncio.gather(*tasks, return_exceptions=True)
-                await asyncio.gather(*self._sending, return_exceptions=True)
+                await asyncio.gather(*self._tasks, return_exceptions=True)
                 await asyncio.to_thread(self._close)
             for result in results:
                 if isinstance(result, Exception):
@@ -268,7 +279,7 @@ class Unit:
             self._pipeline = None
             for command in commands:
                 if command.verb != "image":
-                    self.uplink.finish(command, CANNOT.get(command.verb, NO_POSE))
+                    self.uplink.finish(command, NO_POSE)
             searching = f"looking for the board: {self._search.outcome}"[:MAX_TEXT] if self._search.outcome else None
             health = Health(frame=frame.frame_number, trouble=searching)
             self._trouble = searching or NO_POSE
@@ -287,6 +298,10 @@ class Unit:
         self._trouble = report.health.trouble
         self.uplink.offer(report)
         await self._show(commands, frame, joints)
+        refining = self._refining
+        if refining is not None and len(refining.frames) == REFINE_FRAMES:
+            self._refining = None
+            self._in_background(self._refine(refining))
 
     def _limit_s(self, assignment: Assignment, commands: list[Command]) -> float:
         """How long a frame may take: longer where the cell is drawn anew for it, or something was asked for."""
@@ -301,9 +316,7 @@ class Unit:
                 except InputError as error:
                     self.uplink.finish(command, str(error))
                     continue
-                task = asyncio.create_task(self._send(command, picture))
-                self._sending.add(task)
-                task.add_done_callback(self._sending.discard)
+                self._in_background(self._send(command, picture))
 
     async def _send(self, command: Command, picture: NDArray[np.uint16]) -> None:
         assert self._camera is not None
@@ -315,6 +328,29 @@ class Unit:
             self.uplink.finish(command, str(error))
         else:
             self.uplink.finish(command)
+
+    async def _refine(self, refining: _Refining) -> None:
+        """Refine the pose by the frames gathered, while others are processed, and tell the master."""
+        try:
+            found = await asyncio.to_thread(refining.refiner.refine, refining.frames)
+            pipeline = self._pipeline
+            if pipeline is None or not np.array_equal(pipeline.T_world_camera, refining.refiner.T_world_camera):
+                raise InputError("the camera's pose changed meanwhile")
+            if found.accepted:
+                # Of a camera that moved, what was learned shows another place.
+                self._refined = None if self._stance.verdict.moved else found.T_world_camera
+                await self.uplink.tell_pose(found.T_world_camera, "refined", PoseQuality())
+        except CellwatchError as error:
+            self.uplink.finish(refining.command, str(error)[:MAX_TEXT])
+        else:
+            outcome = f"{DONE}: {found.reason}" if found.accepted else found.reason
+            logger.info("refining the pose: %s", outcome)
+            self.uplink.finish(refining.command, outcome[:MAX_TEXT])
+
+    def _in_background(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     def _localises(self, assignment: Assignment) -> bool:
         """Whether to look for the board without being asked."""
@@ -429,10 +465,17 @@ class Unit:
             if assignment.cell is not applied.cell or settings != _filter_settings(applied):
                 pipeline.adopt(assignment.cell, settings)
             if not np.array_equal(T_world_camera, pipeline.T_world_camera):
-                pipeline.move(T_world_camera)
-                self._find_background(pipeline)
+                self._move(pipeline, T_world_camera)
         self._pipeline, self._applied = pipeline, assignment
         return pipeline
+
+    def _move(self, pipeline: DepthPipeline, T_world_camera: Transform) -> None:
+        """The camera is elsewhere, or is merely known better: then what was learned holds."""
+        refined = self._refined is not None and np.array_equal(T_world_camera, self._refined)
+        pipeline.move(T_world_camera, refined=refined)
+        if refined and pipeline.reference is not None:
+            self._store.save(self._place(pipeline), pipeline.reference)
+        self._find_background(pipeline)
 
     def _find_background(self, pipeline: DepthPipeline) -> None:
         """What was learned at this place before, or else begin to learn if the configuration says so."""
@@ -454,13 +497,17 @@ class Unit:
             self._end_learning("it was asked to begin anew")
             pipeline.use(None)
             self._learning = _Learning(pipeline.learner(), frames, command)
+        elif command.verb == "refine":
+            if self._refining is not None:
+                self.uplink.finish(self._refining.command, "it was asked to begin anew")
+            self._refining = _Refining(command, [], pipeline.refiner())
         elif command.verb == "drop_background":
             self._end_learning("it was asked to drop the background")
             pipeline.use(None)
             self._store.drop()
             self.uplink.finish(command)
         elif command.verb != "image":
-            self.uplink.finish(command, CANNOT.get(command.verb, f"this unit does not know how to {command.verb}"))
+            self.uplink.finish(command, f"this unit does not know how to {command.verb}")
 
     def _end_learning(self, outcome: str) -> None:
         """Learn no more; whoever asked for it is told the `outcome`."""
@@ -504,6 +551,7 @@ class Unit:
             voxels, beyond = voxels.nearest(pipeline.T_world_camera[:3, 3], MAX_VOXELS)
             seen = seen.without(beyond)
         health, stance = pipeline.health(), self._judge(pipeline, frame)
+        self._gather(pipeline, frame, joints)
         return Report(
             assignment,
             frame.captured_at_ns,
@@ -521,6 +569,16 @@ class Unit:
                 warning=stance.warning or crowd,
             ),
         )
+
+    def _gather(self, pipeline: DepthPipeline, frame: DepthFrame, joints: JointEstimate | None) -> None:
+        """Keep the frame without the robot, when the pose is to be refined."""
+        refining = self._refining
+        if refining is None or len(refining.frames) == REFINE_FRAMES:
+            return
+        if joints is None and pipeline.cell.robot is not None:
+            # Wherever it may stand: it must not be taken for CAD.
+            return
+        refining.frames.append(pipeline.without_robot(frame.depth, None if joints is None else joints.positions))
 
     def _judge(self, pipeline: DepthPipeline, frame: DepthFrame) -> Verdict:
         """Whether the camera still stands where it stood, and sees."""

@@ -161,7 +161,7 @@ class Command(Message):
 
 
 class Outcome(NamedTuple):
-    """What became of a command: `DONE`, or why it was not carried out."""
+    """What became of a command: `DONE`, perhaps with what it gained, or why it was not carried out."""
 
     id: Counter
     text: Text

@@ -40,6 +40,7 @@ from shared.messages import DONE, CommandRow, JointsRequest, Outcome, UnitRow, V
 from shared.settings import Settings
 from shared.transforms import from_xyz_rpy, inverse
 from simulation.board_picture import BoardPicture
+from tests.edge_unit import scenes
 from tests.master_server.fakes import cell as make_cell
 from tests.master_server.fakes import master as make_master
 
@@ -67,6 +68,7 @@ class FakeSource:
     def __init__(self) -> None:
         self.queue: asyncio.Queue[NDArray[np.uint16] | Exception | None] = asyncio.Queue()
         self.serial = "A"
+        self.camera = CAMERA
         self.opened = 0
         self.closed = 0
         self.number = 0
@@ -74,7 +76,7 @@ class FakeSource:
 
     async def open(self) -> CameraInfo:
         self.opened += 1
-        return CameraInfo(self.serial, "fake", CAMERA)
+        return CameraInfo(self.serial, "fake", self.camera)
 
     async def frames(self) -> AsyncIterator[DepthFrame]:
         while True:
@@ -428,8 +430,74 @@ async def test_what_a_unit_cannot_do_it_says(tmp_path: Path) -> None:
         assert await outcome_of(bench, "drop_background") == "the pose of its camera is not known yet"
         bench.master.set_pose(1, _matrix(ABOVE), "operator", None)
         await bench.until(lambda: bench.unit.uplink.assignment.T_world_camera is not None, "the pose")
-        assert await outcome_of(bench, "refine") == "this unit cannot refine its pose by the CAD"
         assert await outcome_of(bench, "drop_background") == DONE
+
+
+class RefineBench(Bench):
+    """The small cell's crate and floor, before a camera whose configured pose is 17 mm and 0.7 degrees off."""
+
+    def __init__(self, folder: Path, **config: Any) -> None:
+        off = from_xyz_rpy((0.01, -0.01, 0.01), np.radians((0.4, -0.4, 0.4)))
+        rows = tuple(tuple(row) for row in (scenes.OVERHEAD @ off).tolist())
+        super().__init__(folder, T_world_camera=PoseConfig(matrix=rows), **config)
+        cell = scenes.small_cell(robot=False)
+        self.serve(Master(cell, Settings(stale_after_s=60.0)))
+        self.source.camera = eye = scenes.camera(424, 240)
+        self.frame = scenes.measured(scenes.raycast(scenes.bodies(cell, None), scenes.OVERHEAD, eye), eye)
+
+    async def refine(self) -> CommandRow:
+        """Ask for it, show frames, and wait for what became of it."""
+        asked = self.master.ask(1, "refine", monotonic_ns())
+        await self.until(lambda: not self.unit.uplink.commands.empty(), "the command")
+        for _ in range(unit_module.REFINE_FRAMES):
+            self.show(self.frame)
+
+        def told() -> CommandRow | None:
+            row = self.row()
+            last = row.last_command if row else None
+            return last if last is not None and last.id == asked.id and last.outcome is not None else None
+
+        found = await self.until(told, "what became of it")
+        assert isinstance(found, CommandRow)
+        return found
+
+
+async def test_a_pose_is_refined_by_the_cad_on_request(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(RefineBench, tmp_path)
+    async with bench.running():
+        bench.show(bench.frame)
+        before = await bench.until_state("live")
+        assert before.T_world_camera is not None
+        told = await bench.refine()
+        assert told.outcome is not None
+        assert told.outcome.startswith("done: moved by")
+        assert "mm off in the median" in told.outcome
+        row = bench.row()
+        assert row is not None
+        assert row.pose_origin == "refined"
+        off_mm = 1000.0 * np.linalg.norm(np.subtract(row.T_world_camera, scenes.OVERHEAD)[:3, 3])
+        assert off_mm < 6.0
+        # Once more there is nothing to be gained.
+        bench.show(bench.frame)
+        await bench.until_state("live")
+        again = await bench.refine()
+        assert again.outcome is not None
+        assert "as good as it gets" in again.outcome or again.outcome.startswith("done")
+
+
+async def test_a_refined_pose_keeps_what_was_learned(tmp_path: Path) -> None:
+    bench = await asyncio.to_thread(RefineBench, tmp_path, learn_background_frames=3)
+    async with bench.running():
+        for _ in range(3):
+            bench.show(bench.frame)
+        await bench.until_state("live")
+        assert (await bench.refine()).outcome != DONE
+        bench.show(bench.frame)
+        row = await bench.until_state("live")
+        pipeline = bench.unit._pipeline
+        assert pipeline is not None
+        assert pipeline.reference is not None
+        assert np.array_equal(pipeline.T_world_camera, np.array(row.T_world_camera))
 
 
 async def test_who_asked_for_a_background_is_told_when_it_is_given_up(tmp_path: Path) -> None:

@@ -39,7 +39,9 @@ from master_server.websocket import SERVER_OPTIONS
 from shared.cell import Cell
 from shared.clock import monotonic_ns
 from shared.configuration import assignments, load
+from shared.discovery import Announcement, Announcer, only_loopback
 from shared.errors import CellwatchError, ConfigError
+from shared.messages import CONTRACT_VERSION
 from shared.service import ServiceManager
 
 logger = logging.getLogger("master_server")
@@ -89,8 +91,11 @@ class _Server(uvicorn.Server):
         ready_file: Path | None,
         host: str,
         status: Callable[[], str],
+        announcer: Announcer | None,
     ) -> None:
         super().__init__(config)
+        self._announcer = announcer
+        self._announcing: asyncio.Task[None] | None = None
         self._acceptor = Acceptor(listener, limits, self._protocol, tls)
         self._everywhere = f" and all other addresses of {socket.gethostname()}" if host in ANY_ADDRESS else ""
         self._ready = ready
@@ -116,13 +121,19 @@ class _Server(uvicorn.Server):
         self._manager.ready(self._status())
         if self._manager.listens:
             self._informing = asyncio.create_task(self._manager.follow(self._status))
+        if self._announcer is not None:
+            self._announcing = asyncio.create_task(self._announcer.run())
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self._manager.stopping()
         if self._informing is not None:
             self._informing.cancel()
+        if self._announcing is not None:
+            self._announcing.cancel()
         self._acceptor.close()
         await super().shutdown(sockets)
+        if self._announcing is not None:
+            await asyncio.wait((self._announcing,))
 
     def _protocol(self) -> GuardedHttp:
         return GuardedHttp(self.config, self.server_state, self.lifespan.state)
@@ -132,10 +143,18 @@ def _serve_master(options: argparse.Namespace) -> None:
     config = _config(options)
     configure(config.log_level, config.log_format)
     cell = Cell.load(config.cell)
+    announced = config.announce
+    if announced is None:
+        announced = not only_loopback(config.host)
     with contextlib.closing(Store.open(config.state_dir / FILE_NAME)) as store:
         master = Master(cell, config.settings, store)
         recorder = Recorder(master, config.recording, config.state_dir / "recordings")
-        _serve(config, lambda access, limits: make_app(master, access, recorder, limits))
+
+        def says(sha256: str) -> Announcement:
+            cell = master.published.reference
+            return Announcement(cell.name, cell.sha256, CONTRACT_VERSION, bool(sha256), sha256)
+
+        _serve(config, lambda access, limits: make_app(master, access, recorder, limits), says if announced else None)
 
 
 def _serve_replay(options: argparse.Namespace) -> None:
@@ -167,16 +186,22 @@ def _progress(file: Path) -> Progress | None:
     return tell
 
 
-def _serve(config: ServerConfig, make: Callable[[Access, Limits], Application]) -> None:
+def _serve(
+    config: ServerConfig,
+    make: Callable[[Access, Limits], Application],
+    says: Callable[[str], Announcement] | None = None,
+) -> None:
+    """Serve until told to stop; `says` is given the certificate's fingerprint, empty without TLS, and announced."""
     access = load_access(config.state_dir, config.public_reads)
-    tls = None
+    tls, sha256 = None, ""
     if config.tls_certificate is not None and config.tls_key is not None:
         tls = server_context(config.tls_certificate, config.tls_key)
-        print(f"master-server: the certificate's fingerprint is sha256 {fingerprint(config.tls_certificate)}")
+        sha256 = fingerprint(config.tls_certificate)
+        print(f"master-server: the certificate's fingerprint is sha256 {sha256}")
     limits = Limits()
     app = make(access, limits)
     listener = _listen(config.host, config.port)
-    port = listener.getsockname()[1]
+    listens_at, port = listener.getsockname()[:2]
     host = "127.0.0.1" if config.host in ANY_ADDRESS else config.host
     ready = {
         "url": f"{'http' if tls is None else 'https'}://{f'[{host}]' if ':' in host else host}:{port}",
@@ -205,6 +230,7 @@ def _serve(config: ServerConfig, make: Callable[[Access, Limits], Application]) 
         config.ready_file,
         config.host,
         lambda: _status(app.state.master, ready["url"]),
+        Announcer(lambda: says(sha256), listens_at, port) if says is not None else None,
     )
     # Once it has stopped in good order, the server raises the signal that it got again.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -235,7 +261,7 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _config(options: argparse.Namespace) -> MasterConfig:
-    overrides = _overrides(options, ("cell", *LISTENING))
+    overrides = _overrides(options, ("cell", "announce", *LISTENING))
     if options.record is not None:
         overrides |= {"recording.enabled": True, "recording.folder": str(options.record)}
     return load(MasterConfig, options.config, os.environ, ENVIRONMENT_PREFIX, overrides)
@@ -257,6 +283,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--config", type=Path, metavar="YAML", help="configuration file")
     parser.add_argument("--cell", type=Path, metavar="YAML", help="the cell that is watched (cell.yaml)")
     _add_server_options(parser)
+    parser.add_argument(
+        "--announce",
+        action=argparse.BooleanOptionalAction,
+        help="tell units by multicast DNS where it listens (default: unless that is loopback only)",
+    )
     parser.add_argument("--record", type=Path, metavar="DIR", help="record what the master sees, as MCAP files")
     return parser
 

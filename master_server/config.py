@@ -57,6 +57,9 @@ class MasterConfig(ServerConfig):
 
     cell: Path = Field(description="The cell's `cell.yaml`.")
     settings: Settings = Field(default=Settings(), description="What the master starts with.")
+    announce: bool | None = Field(
+        default=None, description="Whether to tell units by multicast DNS where it listens; not told: beyond loopback."
+    )
     recording: RecordingConfig = Field(default=RecordingConfig(), description="What is recorded, and how much is kept.")
 
 

@@ -21,4 +21,5 @@ In the order of the flow:
     timebase       how far the master's clock is from a unit's
     messages       what units and master say to each other, as models
     wire           those messages as bytes
+    discovery      how a master is found
 """

@@ -27,6 +27,7 @@ from typing import Any, TypeVar
 
 import msgpack
 import numpy as np
+import ormsgpack
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
@@ -68,7 +69,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def unpack(data: bytes, max_bytes: int) -> Any:
-    """Plain msgpack, arrays as tuples.
+    """Plain msgpack, arrays as lists, names as text.
 
     Raises:
         WireError: longer than `max_bytes`, or malformed.
@@ -76,10 +77,10 @@ def unpack(data: bytes, max_bytes: int) -> Any:
     if len(data) > max_bytes:
         raise WireError(f"message: expected at most {max_bytes} bytes, got {len(data)}")
     try:
-        return msgpack.unpackb(data, use_list=False, strict_map_key=True)
-    except (ValueError, TypeError, msgpack.UnpackException) as error:
-        # All ways in which msgpack says that bytes are malformed; TypeError is an unhashable key.
-        raise WireError(f"message: no msgpack: {error or type(error).__name__}") from error
+        # Not `msgpack`, which interns all names: up to Python 3.12.5 what is interned is never freed.
+        return ormsgpack.unpackb(data)
+    except ormsgpack.MsgpackDecodeError as error:
+        raise WireError(f"message: no msgpack: {error}") from error
 
 
 def encode(message: BaseModel) -> bytes:
@@ -94,7 +95,11 @@ def decode(model: type[Model], data: bytes, max_bytes: int = MAX_ANSWER_BYTES) -
     Raises:
         WireError: too long, no msgpack, or a field is missing, unknown, of another type or out of range.
     """
-    return _validated(model, unpack(data, max_bytes))
+    fields = unpack(data, max_bytes)
+    try:
+        return _validated(model, _with_tuples(fields))
+    except RecursionError as error:
+        raise WireError("message: expected values in a few levels, got them nested too deeply") from error
 
 
 def encode_update(update: UpdateRequest) -> bytes:
@@ -112,7 +117,7 @@ def decode_update(data: bytes) -> UpdateRequest:
     Raises:
         WireError: as in `decode`.
     """
-    return _validated(UpdateRequest, _named(unpack(data, MAX_UPDATE_BYTES)))
+    return _validated(UpdateRequest, _named(_with_rows(unpack(data, MAX_UPDATE_BYTES))))
 
 
 def encode_update_answer(answer: UpdateAnswer, answered_at_ns: int | None = None) -> bytes:
@@ -136,7 +141,7 @@ def decode_update_answer(data: bytes) -> UpdateAnswer:
     Raises:
         WireError: as in `decode`.
     """
-    fields = _named(unpack(data, MAX_ANSWER_BYTES))
+    fields = _named(_with_rows(unpack(data, MAX_ANSWER_BYTES)))
     if isinstance(fields, dict) and "joints" in fields:
         fields["joints"] = _joint_samples(fields["joints"])
     return _validated(UpdateAnswer, fields)
@@ -205,6 +210,26 @@ def _validated(model: type[Model], fields: Any) -> Model:
         return model.model_validate(fields, strict=True)
     except ValidationError as error:
         raise WireError(sentence(error)) from error
+
+
+def _with_tuples(value: Any) -> Any:
+    """The same with tuples in place of lists, as models have them."""
+    if isinstance(value, list):
+        return tuple([_with_tuples(one) for one in value])
+    if isinstance(value, dict):
+        return {name: _with_tuples(one) for name, one in value.items()}
+    return value
+
+
+def _with_rows(fields: Any) -> Any:
+    """The same for what takes no more levels than an update does, in less time; deeper lists stay and are refused."""
+    if isinstance(fields, dict):
+        for name, value in fields.items():
+            if isinstance(value, list):
+                fields[name] = tuple([tuple(one) if isinstance(one, list) else one for one in value])
+            elif isinstance(value, dict):
+                fields[name] = {key: tuple(one) if isinstance(one, list) else one for key, one in value.items()}
+    return fields
 
 
 def _named(fields: Any) -> Any:

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import random
+import sys
 import zlib
 from typing import Any
 
@@ -39,6 +40,7 @@ from shared.wire import (
     keys_from_bytes,
     keys_to_bytes,
     pack_seen,
+    unpack,
     unpack_seen,
 )
 
@@ -285,3 +287,12 @@ def test_none_is_left_out_of_other_messages() -> None:
     body = encode(Health(trouble=None))
     assert "trouble" not in msgpack.unpackb(body)
     assert decode(Health, body) == Health()
+
+
+def test_names_of_strangers_are_not_kept_for_ever() -> None:
+    name = "".join(["a name", " that nobody", " else uses"])
+    (found,) = unpack(msgpack.packb({name: 1}), 100)
+    # The first of its kind that is interned, so none was before.
+    assert sys.intern(name) is name
+    assert found == name
+    assert found is not name

@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any, Literal
 
-import msgpack
 import numpy as np
+import orjson
+import ormsgpack
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
@@ -65,12 +65,12 @@ class CoverageAnswer(BaseModel):
 
 
 def map_fields(view: MapView, form: Form, unseen: dict[str, Any] | None, now_ns: int) -> dict[str, Any]:
-    """The fields of `VoxelsAnswer`, as plain numbers and lists."""
+    """The fields of `VoxelsAnswer`, as plain numbers and lists but for the voxels, which are arrays."""
     return {
         "lattice": LatticeDescription.of(view.lattice).model_dump(),
         "lattice_version": view.lattice_version,
         "voxels": _voxels(view, form),
-        "witnesses": view.witnesses.tolist(),
+        "witnesses": np.ascontiguousarray(view.witnesses),
         "complete": view.complete,
         "reasons": list(view.reasons),
         "oldest_view_age_s": None if view.oldest_view_age_s is None else round(view.oldest_view_age_s, 4),
@@ -82,7 +82,7 @@ def map_fields(view: MapView, form: Form, unseen: dict[str, Any] | None, now_ns:
 
 def unseen_fields(blocks: Lattice, seen_by: NDArray[np.uint8]) -> dict[str, Any]:
     """The blocks (nx, ny, nz) that nobody looks through, by their indices."""
-    return {**LatticeDescription.of(blocks).model_dump(), "blocks": np.argwhere(seen_by == 0).tolist()}
+    return {**LatticeDescription.of(blocks).model_dump(), "blocks": np.ascontiguousarray(np.argwhere(seen_by == 0))}
 
 
 def coverage_shares(seen_by: NDArray[np.uint8]) -> list[float]:
@@ -108,24 +108,23 @@ def coverage_fields(master: Readable, with_blocks: bool, now_ns: int) -> dict[st
     }
 
 
-def as_json(fields: dict[str, Any]) -> str:
-    """Compact JSON. By hand, since the framework takes ten times as long for a thousand voxels."""
-    return json.dumps(fields, separators=(",", ":"))
+def as_json(fields: dict[str, Any]) -> bytes:
+    """Compact JSON. Arrays are written as they lie: by way of lists all updates would wait 40 ms for 15,000 centres."""
+    return orjson.dumps(fields, option=orjson.OPT_SERIALIZE_NUMPY)
 
 
 def as_msgpack(fields: dict[str, Any]) -> bytes:
     """The same as msgpack."""
-    packed: bytes = msgpack.packb(fields)
-    return packed
+    return ormsgpack.packb(fields, option=ormsgpack.OPT_SERIALIZE_NUMPY)
 
 
-def _voxels(view: MapView, form: Form) -> list[Any]:
+def _voxels(view: MapView, form: Form) -> NDArray[Any]:
     if form == "keys":
-        return list(view.keys.tolist())
+        return np.ascontiguousarray(view.keys)
     indices = view.lattice.indices(view.keys)
     if form == "indices":
-        return list(indices.tolist())
-    return list(np.round(view.lattice.centres(indices), CENTRE_DECIMALS).tolist())
+        return np.ascontiguousarray(indices)
+    return np.ascontiguousarray(np.round(view.lattice.centres(indices), CENTRE_DECIMALS))
 
 
 def _block_counts(blocks: Lattice, seen_by: NDArray[np.uint8]) -> dict[str, Any]:

@@ -70,7 +70,7 @@ class Picture:
             began_ns = stage_ns()
             fields = map_fields(self._view, wish.form, self._unseen if wish.unseen else None, self.now_ns)
             fields |= {"number": self.number, "units": self._units}
-            message = as_json(fields) if wish.encoding == "json" else as_msgpack(fields)
+            message = as_json(fields).decode() if wish.encoding == "json" else as_msgpack(fields)
             self._encoded[wish] = message
             self.cost_ns += stage_ns() - began_ns
         return message

@@ -194,6 +194,10 @@ class _Folder:
     def add(self, moment: Moment) -> None:
         """Write a moment; raises _Stopped."""
         try:
+            if self._is_done:
+                # Only now, so that no file is begun that nothing comes to stand in.
+                self._finish()
+                self._file = self._next()
             finished_chunk = self._file.add(moment)
             self._tell()
             self._run.moments += 1
@@ -203,9 +207,7 @@ class _Folder:
                 self._finish()
                 raise _Stopped(full)
             long = moment.at_ns - self._began_ns >= self._config.file_s_max * NS_PER_S
-            if long or self._file.bytes_written >= self._config.file_bytes_max:
-                self._finish()
-                self._file = self._next()
+            self._is_done = long or self._file.bytes_written >= self._config.file_bytes_max
         except OSError as error:
             self._file.abandon()
             raise _Stopped(_sentence(self._file.path, error)) from error
@@ -222,6 +224,7 @@ class _Folder:
         if full := self._full():
             raise _Stopped(full)
         self._began_ns = monotonic_ns()
+        self._is_done = False
         now_ns = wall_ns()
         self._maps_before = self._run.maps
         when = datetime.fromtimestamp(now_ns / NS_PER_S, timezone.utc).strftime("%Y%m%dT%H%M%S.%fZ")

@@ -44,6 +44,9 @@ MAX_UNITS = 64
 
 assert MAX_UNITS <= MAX_WITNESSES
 
+REFINED_MM, REFINED_DEG = 100.0, 5.0
+"""A pose that was refined lies this near to the one that a unit was told: as far as units refine."""
+
 FPS_FRAMES = 31
 """Frames over which the frame rate is taken: two seconds at 15 fps."""
 
@@ -492,6 +495,8 @@ def _pose_warning(record: UnitRecord, told: Matrix | None) -> str:
     known_pose, told_pose = np.array(record.T_world_camera), np.array(told)
     shift_mm = 1e3 * float(np.linalg.norm(known_pose[:3, 3] - told_pose[:3, 3]))
     turn_deg = math.degrees(angle_rad(inverse(known_pose) @ told_pose))
+    if record.pose_origin == "refined" and shift_mm <= REFINED_MM and turn_deg <= REFINED_DEG:
+        return ""
     return (
         f"the unit's configuration has its camera {shift_mm:.0f} mm and {turn_deg:.1f}° from where it is by the pose "
         f"that counts ({record.pose_origin})"

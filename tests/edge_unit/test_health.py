@@ -82,6 +82,6 @@ def test_surfaces_too_far_for_16_bits_are_unknown() -> None:
 def test_another_static_layer_is_taken_in() -> None:
     checker = HealthCheck(CAMERA)
     depth = np.full(CAMERA.shape, 1500, np.uint16)
-    assert checker.check(depth, WALL_M, NO_ROBOT, SETTINGS).agreeing_share == 1.0
-    assert checker.check(depth, WALL_M + 1.0, NO_ROBOT, SETTINGS).agreeing_share == 0.0
-    assert checker.check(depth, WALL_M, NO_ROBOT, SETTINGS).agreeing_share == 1.0
+    assert checker.check(depth, measured(WALL_M, CAMERA), NO_ROBOT, SETTINGS).agreeing_share == 1.0
+    assert checker.check(depth, measured(WALL_M + 1.0, CAMERA), NO_ROBOT, SETTINGS).agreeing_share == 0.0
+    assert checker.check(depth, measured(WALL_M, CAMERA), NO_ROBOT, SETTINGS).agreeing_share == 1.0

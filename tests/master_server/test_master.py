@@ -618,6 +618,14 @@ def test_a_configured_pose_never_replaces_a_better_one_and_the_row_says_so(origi
     assert one.registry.get(1).warning == ""
 
 
+def test_a_configured_pose_that_was_refined_is_no_reason_to_warn() -> None:
+    one = master()
+    tell(one, shifted(0.2))
+    one.set_pose(1, shifted(0.25), "refined", None)
+    assert tell(one, shifted(0.2)).initialized.T_world_camera == shifted(0.25)
+    assert one.units(LATER_NS + MS)[0].reason == ""
+
+
 def test_two_cameras_behind_one_address_do_not_take_turns() -> None:
     one = master()
     first = live(one, 1, 5)

@@ -185,6 +185,7 @@ class _Folder:
         self._folder = folder
         self._config = config
         self._run = run
+        self._is_done = False
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._file = self._next()

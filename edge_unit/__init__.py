@@ -40,7 +40,7 @@ In the order of the flow:
     progress        whether the work on frames makes progress
     config          the unit's own configuration
     unit            the daemon: source, pipeline and uplink held together
-    board           what the board itself tells: its clock, its USB
+    host            what the computer itself tells: its clock, its USB
     doctor          is all there that a unit needs, and what is to be done if not
     __main__        the command line
 """

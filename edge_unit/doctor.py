@@ -17,10 +17,10 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_unit.board import clock_is_set, usb_cameras
 from edge_unit.cell_cache import mesh_hashes
 from edge_unit.client import MasterClient
 from edge_unit.config import UnitConfig
+from edge_unit.host import clock_is_set, usb_cameras
 from edge_unit.jit_cache import PRIVATE, settle
 from edge_unit.sources import capture_link as link
 from edge_unit.sources.capture_session import CaptureSession

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the board itself tells: whether its clock is set, and which cameras hang on its USB."""
+"""What the computer itself tells: whether its clock is set, and which cameras hang on its USB."""
 
 from __future__ import annotations
 

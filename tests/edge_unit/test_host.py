@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from edge_unit.board import clock_is_set, usb_cameras
+from edge_unit.host import clock_is_set, usb_cameras
 
 
 def plug(devices: Path, name: str, **files: str) -> None:

@@ -150,6 +150,8 @@ class GuardedHttp(HttpToolsProtocol):
     leave: Callable[[], None] | None = None
     begun = False
     _deadline: asyncio.TimerHandle | None = None
+    _allowed_s: float | None = None
+    _begins_anew = False
     _in_head = True
     _head_bytes = 0
 
@@ -172,11 +174,17 @@ class GuardedHttp(HttpToolsProtocol):
             self._head_bytes += len(data)
             if self._head_bytes > MAX_HEAD_BYTES:
                 self.send_400_response(f"Expected a head of at most {MAX_HEAD_BYTES} bytes.")
+        if self.transport.is_closing():
+            # Also for one who does not read why.
+            self._give(HEAD_S)
+        elif self._begins_anew:
+            # Once for all that came: a request that came whole needs no timer.
+            self._give(self._allowed_s)
 
     def on_message_begin(self) -> None:
         super().on_message_begin()
         self._in_head, self._head_bytes = True, 0
-        self._give(HEAD_S)
+        self._allow(HEAD_S)
 
     def on_header(self, name: bytes, value: bytes) -> None:
         # What comes after a body is no header that anyone asks for.
@@ -185,22 +193,27 @@ class GuardedHttp(HttpToolsProtocol):
 
     def on_headers_complete(self) -> None:
         self._in_head = False
-        self._give(MESSAGE_S)
+        self._allow(MESSAGE_S)
         super().on_headers_complete()
 
     def on_message_complete(self) -> None:
-        self._give(None)
+        self._allow(None)
         super().on_message_complete()
 
     def handle_websocket_upgrade(self) -> None:
-        self._give(None)
+        self._allow(None)
         super().handle_websocket_upgrade()
         protocol = self.transport.get_protocol()
         if isinstance(protocol, ReaderSocket):
             protocol.leave, self.leave = self.leave, None
 
+    def _allow(self, seconds: float | None) -> None:
+        """For what comes next, from the end of what has come already."""
+        self._allowed_s, self._begins_anew = seconds, True
+
     def _give(self, seconds: float | None) -> None:
         """Until the connection is closed, unless this is called again."""
+        self._begins_anew = False
         if self._deadline is not None:
             self._deadline.cancel()
         self._deadline = None if seconds is None else self.loop.call_later(seconds, self.transport.abort)

@@ -38,6 +38,9 @@ CONNECTIONS_PER_ADDRESS = 64
 CONNECTIONS_MAX = 512
 """Twice what 64 units hold, and half of the 1024 files that a process may open by default."""
 
+STRANGERS_MAX = 256
+"""Of these, for addresses that have shown no valid token lately: a crowd of them shuts no unit out."""
+
 ADDRESSES_MAX = 4096
 """Remembered; beyond, the one that came first is forgotten, which only loosens its limit."""
 
@@ -114,7 +117,7 @@ class Limits:
             Refusal: 429, this address has shown too many wrong ones and no right one lately.
         """
         wait_ns = self.wrong_tokens.wait_ns(ip, now_ns)
-        if wait_ns > 0 and now_ns - self._trusted_at_ns.get(ip, -(10**18)) > TRUSTED_S * NS_PER_S:
+        if wait_ns > 0 and not self._is_trusted(ip, now_ns):
             raise _too_many(f"token: {ip} has shown too many wrong ones", wait_ns)
 
     def token_was_wrong(self, ip: str, now_ns: int) -> None:
@@ -128,7 +131,8 @@ class Limits:
     def connect(self, ip: str, now_ns: int) -> bool:
         """Whether this address may have one more connection; if so it is counted until `disconnect`."""
         open_here = self._open.get(ip, 0)
-        if open_here >= CONNECTIONS_PER_ADDRESS or self._open_count >= CONNECTIONS_MAX:
+        open_max = CONNECTIONS_MAX if self._is_trusted(ip, now_ns) else STRANGERS_MAX
+        if open_here >= CONNECTIONS_PER_ADDRESS or self._open_count >= open_max:
             return False
         if self.new_connections.wait_ns(ip, now_ns) > 0:
             return False
@@ -144,6 +148,9 @@ class Limits:
             del self._open[ip]
         else:
             self._open[ip] -= 1
+
+    def _is_trusted(self, ip: str, now_ns: int) -> bool:
+        return now_ns - self._trusted_at_ns.get(ip, -(10**18)) <= TRUSTED_S * NS_PER_S
 
     @property
     def connections(self) -> int:

@@ -14,6 +14,7 @@ from master_server.limits import (
     CONNECTIONS_PER_ADDRESS,
     REQUESTS_BURST,
     REQUESTS_PER_S,
+    STRANGERS_MAX,
     TRUSTED_S,
     WRONG_TOKENS_BURST,
     Limits,
@@ -105,10 +106,27 @@ def test_connections_are_bounded_for_each_address_and_in_all() -> None:
     count = CONNECTIONS_PER_ADDRESS
     for number in range(2, 2000):
         count += limits.connect(f"10.0.0.{number}", START_NS)
-    assert count == limits.connections == CONNECTIONS_MAX
+    assert count == limits.connections == STRANGERS_MAX
     for _ in range(CONNECTIONS_PER_ADDRESS):
         limits.disconnect("10.0.0.1")
-    assert limits.connections == CONNECTIONS_MAX - CONNECTIONS_PER_ADDRESS
+    assert limits.connections == STRANGERS_MAX - CONNECTIONS_PER_ADDRESS
+
+
+def test_a_crowd_of_strangers_shuts_no_unit_out() -> None:
+    limits = Limits()
+    for number in range(2 * STRANGERS_MAX):
+        limits.connect(f"10.0.1.{number}", START_NS)
+    assert not limits.connect("10.0.0.1", START_NS)
+    taken = 0
+    for number in range(1, 2 * CONNECTIONS_MAX):
+        limits.token_was_right(f"10.0.0.{number}", START_NS)
+        taken += limits.connect(f"10.0.0.{number}", START_NS)
+    assert taken == CONNECTIONS_MAX - STRANGERS_MAX
+    late_ns = START_NS + round((TRUSTED_S + 1) * S)
+    limits.disconnect("10.0.0.1")
+    assert not limits.connect("10.0.0.1", late_ns)
+    limits.token_was_right("10.0.0.1", late_ns)
+    assert limits.connect("10.0.0.1", late_ns)
 
 
 def test_connections_that_come_and_go_are_bounded_too() -> None:

@@ -29,6 +29,7 @@ In the order of the flow:
     replay       a recording that answers as the master did
     config       the master's own configuration
     routes/      the same as HTTP
+    viewer/      the same in a browser, for operators
     description  the API described, with examples for the cell that is watched
     app          the web application, assembled
     websocket    a socket that keeps nothing for who does not read

@@ -24,7 +24,7 @@ from typing import Any, get_args
 import uvicorn
 
 from master_server.access import Access, Role, load_access, token_file
-from master_server.app import Application, make_app, make_replay_app
+from master_server.app import Application, add_viewer, make_app, make_replay_app
 from master_server.config import ENVIRONMENT_PREFIX, MasterConfig, ReplayConfig, ServerConfig
 from master_server.connections import Acceptor, GuardedHttp, fingerprint, quiet, server_context
 from master_server.limits import Limits
@@ -35,6 +35,9 @@ from master_server.recorded import Progress, Recording, summary
 from master_server.recording import Recorder
 from master_server.replay import Replay
 from master_server.store import FILE_NAME, Store
+from master_server.viewer.host import is_installed
+from master_server.viewer.proxy import PAGE, Gate, link_path
+from master_server.viewer.sessions import LINK_S
 from master_server.websocket import SERVER_OPTIONS
 from shared.cell import Cell
 from shared.clock import monotonic_ns
@@ -92,10 +95,12 @@ class _Server(uvicorn.Server):
         host: str,
         status: Callable[[], str],
         announcer: Announcer | None,
+        gate: Gate | None,
     ) -> None:
         super().__init__(config)
         self._announcer = announcer
         self._announcing: asyncio.Task[None] | None = None
+        self._gate = gate
         self._acceptor = Acceptor(listener, limits, self._protocol, tls)
         self._everywhere = f" and all other addresses of {socket.gethostname()}" if host in ANY_ADDRESS else ""
         self._ready = ready
@@ -118,6 +123,8 @@ class _Server(uvicorn.Server):
         for role in Role:
             lies_in = self._ready[f"{role.value}_token_file"]
             print(f"master-server: the token of the {role.value} lies in {lies_in}", flush=True)
+        if self._gate is not None:
+            print(f"master-server: {self._way_in(self._gate)}", flush=True)
         self._manager.ready(self._status())
         if self._manager.listens:
             self._informing = asyncio.create_task(self._manager.follow(self._status))
@@ -134,6 +141,13 @@ class _Server(uvicorn.Server):
         await super().shutdown(sockets)
         if self._announcing is not None:
             await asyncio.wait((self._announcing,))
+
+    def _way_in(self, gate: Gate) -> str:
+        url = self._ready["url"]
+        if not sys.stdout.isatty():
+            # What is printed here is kept in a log, and no log holds what opens a door.
+            return f"the cell is drawn at {url}{PAGE}"
+        return f"the cell is drawn at {url}{link_path(gate.sessions)} (works once, within {LINK_S // 60} minutes)"
 
     def _protocol(self) -> GuardedHttp:
         return GuardedHttp(self.config, self.server_state, self.lifespan.state)
@@ -200,6 +214,7 @@ def _serve(
         print(f"master-server: the certificate's fingerprint is sha256 {sha256}")
     limits = Limits()
     app = make(access, limits)
+    gate = add_viewer(app, config.unit_actions) if config.viewer and is_installed() else None
     listener = _listen(config.host, config.port)
     listens_at, port = listener.getsockname()[:2]
     host = "127.0.0.1" if config.host in ANY_ADDRESS else config.host
@@ -231,6 +246,7 @@ def _serve(
         config.host,
         lambda: _status(app.state.master, ready["url"]),
         Announcer(lambda: says(sha256), listens_at, port) if says is not None else None,
+        gate,
     )
     # Once it has stopped in good order, the server raises the signal that it got again.
     signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -27,6 +27,10 @@ from master_server.routes.common import ip_of, log_refusal, refused
 from master_server.routes.replay import RefusedUpdate
 from master_server.routes.update import UpdateEndpoint
 from master_server.stream import Stream
+from master_server.viewer import proxy
+from master_server.viewer.host import ViewerHost
+from master_server.viewer.proxy import Gate
+from master_server.viewer.sessions import Sessions
 from shared.clock import monotonic_ns
 from shared.configuration import sentence_of
 from shared.errors import CellError, CellwatchError, InputError, Refusal, WireError
@@ -113,6 +117,14 @@ def make_replay_app(played: Replay, access: Access, limits: Limits | None = None
     return app
 
 
+def add_viewer(app: Application, actions: dict[str, str]) -> Gate:
+    """Let operators see it under `/viewer/`; costs nothing while nobody looks."""
+    state = app.state
+    state.viewer = gate = Gate(ViewerHost(app, state.master, state.access, actions), Sessions(state.access))
+    app.include_router(proxy.router)
+    return gate
+
+
 def _assembled(
     kind: type[Application],
     master: Readable,
@@ -134,6 +146,8 @@ def _assembled(
             yield
         finally:
             listeners.stop()
+            if app.state.viewer is not None:
+                await app.state.viewer.host.close()
             if recorder is not None:
                 await recorder.stop()
 
@@ -156,6 +170,7 @@ def _assembled(
     app.state.limits = limits or Limits()
     app.state.stream = listeners
     app.state.recorder = recorder
+    app.state.viewer = None
     for router in routers:
         app.include_router(router)
     serve_documentation(app)

@@ -41,6 +41,13 @@ class ServerConfig(BaseModel):
     public_reads: bool = Field(default=False, description="Whether reading needs no token.")
     log_level: LogLevel = Field(default="INFO", description="The least that is logged.")
     log_format: LogFormat = Field(default="text", description="Lines for people, or JSON for a collector.")
+    viewer: bool = Field(default=True, description="Whether operators find the cell drawn under `/viewer/`.")
+    unit_actions: dict[str, str] = Field(
+        default={},
+        max_length=8,
+        description="What else an operator can do to a unit in the viewer: what the button says, and the address that "
+        "is posted to, with {id}, {ip} and {serial} of the unit.",
+    )
     ready_file: Path | None = Field(
         default=None, description="Written as JSON (url, port, pid, token files) when the master can be asked."
     )

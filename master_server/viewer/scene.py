@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cell, drawn: box, CAD, robot, cameras, obstacles and what nobody sees."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from viser.transforms import SO3
+
+from shared.cell import Cell, PlacedMesh
+from shared.lattice import Lattice
+
+STATE_COLOURS: dict[str, tuple[int, int, int]] = {
+    "live": (40, 160, 70),
+    "stale": (225, 150, 0),
+    "blind": (205, 40, 40),
+    "moved": (170, 50, 190),
+    "uncalibrated": (130, 130, 130),
+}
+
+STATIC_COLOUR, OBJECT_COLOUR, ROBOT_COLOUR = (168, 172, 178), (120, 140, 175), (70, 110, 200)
+BOX_COLOUR = (60, 60, 60)
+UNSEEN_COLOUR = (110, 80, 150)
+UNSEEN_OPACITY = 0.16
+
+WITNESS_COLOURS = np.array([(225, 110, 0), (215, 50, 10), (160, 10, 20)], np.uint8)
+"""Of voxels that one unit reports, two, and more."""
+
+VOXEL_SHARE = 0.92
+"""Of a voxel's edge that is drawn, so that one can tell them apart."""
+
+VOXELS_MAX = 20_000
+"""Beyond, every second or third is drawn: browsers of control rooms draw no more in time."""
+
+FOV_RAD, ASPECT = 1.02, 16.0 / 9.0
+"""Of a D435's depth, vertically; no unit tells the master its own."""
+
+FRUSTUM_M = 0.22
+
+BOX_EDGES = np.array(
+    [(a, b) for a in range(8) for b in range(8) if a < b and bin(a ^ b).count("1") == 1], dtype=np.int64
+)
+"""Pairs of corners, numbered by their bits."""
+
+QUAD = np.array([(0, 1, 2), (0, 2, 3)], np.uint32)
+NO_TURN = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
+
+Points = NDArray[np.float32]
+
+
+def wxyz_of(T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation of a transform (4, 4) as viser has it."""
+    return np.asarray(SO3.from_matrix(np.asarray(T, np.float64)[:3, :3]).wxyz)
+
+
+def cube(edge_m: float) -> tuple[Points, NDArray[np.uint32]]:
+    """Vertices (8, 3) and faces (12, 3) about the origin."""
+    corners = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32) - 0.5
+    faces = [
+        *((0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)),
+        *((2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)),
+    ]
+    return corners * np.float32(edge_m), np.array(faces, np.uint32)
+
+
+def surface(inside: NDArray[np.bool_], lattice: Lattice) -> tuple[Points, NDArray[np.uint32]]:
+    """The faces between blocks that are `inside` (the lattice's shape) and all else, as (V, 3) and (F, 3)."""
+    padded = np.pad(inside, 1)
+    quads = []
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        for step in (0, 1):
+            beside = np.roll(padded, 1 - 2 * step, axis)
+            at = np.argwhere((padded & ~beside)[1:-1, 1:-1, 1:-1])
+            corners = np.repeat(at[:, None, :], 4, axis=1)
+            corners[:, :, axis] += step
+            for number, (du, dv) in enumerate(((0, 0), (1, 0), (1, 1), (0, 1))):
+                corners[:, number, u] += du
+                corners[:, number, v] += dv
+            quads.append(corners)
+    corners = np.concatenate(quads).reshape(-1, 3)
+    points = np.asarray(lattice.origin_m) + corners * lattice.voxel_size_m
+    faces = (np.arange(len(corners) // 4)[:, None, None] * 4 + QUAD).reshape(-1, 3)
+    return points.astype(np.float32), faces.astype(np.uint32)
+
+
+class Scene:
+    """What all who look see alike; one thread at a time."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._cell: Cell | None = None
+        self._parts: list[Any] = []
+        self._links: list[Any] = []
+        self._cameras: dict[int, tuple[Any, Any]] = {}
+        self._told: dict[int, tuple[object, ...]] = {}
+        self._voxels: Any = None
+        self._voxel_size_m = 0.0
+        self._joints: tuple[float, ...] | None = None
+        server.scene.set_up_direction("+z")
+
+    def set_cell(self, cell: Cell) -> None:
+        """Draw another cell."""
+        scene = self._server.scene
+        for part in (*self._parts, *self._links):
+            part.remove()
+        self._cell, self._joints = cell, None
+        low, high = cell.box_min_m, cell.box_max_m
+        bits = np.array([[number >> axis & 1 for axis in range(3)] for number in range(8)])
+        corners = np.where(bits, high, low).astype(np.float32)
+        middle, size = (low + high) / 2.0, high - low
+        self._parts = [
+            scene.add_line_segments("/cell/box", corners[BOX_EDGES], BOX_COLOUR, thickness=0.012),
+            scene.add_grid(
+                "/cell/floor",
+                float(size[0]),
+                float(size[1]),
+                position=(float(middle[0]), float(middle[1]), float(low[2])),
+                cell_size=0.25,
+                section_size=1.0,
+            ),
+            *(self._body(f"/cell/static/{i}", body, STATIC_COLOUR) for i, body in enumerate(cell.static)),
+            *(self._body(f"/cell/objects/{i}", body, OBJECT_COLOUR) for i, body in enumerate(cell.objects)),
+        ]
+        self._links = [
+            scene.add_mesh_simple(
+                f"/robot/{i}",
+                link.mesh.vertices,
+                link.mesh.faces.astype(np.uint32),
+                color=ROBOT_COLOUR,
+                flat_shading=True,
+                visible=False,
+            )
+            for i, link in enumerate(cell.robot.links if cell.robot else ())
+        ]
+        # From a corner and above, so that all of the box is in the picture.
+        eye = middle + np.array([0.62, -0.82, 0.5]) * float(np.linalg.norm(size))
+        self._server.initial_camera.position = eye
+        self._server.initial_camera.look_at = middle - (0.0, 0.0, 0.15 * size[2])
+
+    def set_joints(self, positions: tuple[float, ...] | None) -> None:
+        """The robot stands so; without positions it is not drawn."""
+        if self._cell is None or self._cell.robot is None or positions == self._joints:
+            return
+        self._joints = positions
+        if positions is None or len(positions) != self._cell.robot.joint_count:
+            for link in self._links:
+                link.visible = False
+            return
+        poses = self._cell.robot.link_poses(np.asarray(positions))
+        with self._server.atomic():
+            for link, pose in zip(self._links, poses, strict=True):
+                link.wxyz = wxyz_of(pose)
+                link.position = pose[:3, 3]
+                link.visible = True
+
+    def set_units(self, rows: list[dict[str, Any]]) -> None:
+        """A frustum a unit whose pose is known, in the colour of its state."""
+        posed = {row["id"]: row for row in rows if row["T_world_camera"] is not None}
+        for unit_id in self._cameras.keys() - posed.keys():
+            for part in self._cameras.pop(unit_id):
+                part.remove()
+            self._told.pop(unit_id, None)
+        for unit_id, row in posed.items():
+            told = (row["state"], row["T_world_camera"])
+            if self._told.get(unit_id) != told:
+                self._told[unit_id] = told
+                self._draw_camera(unit_id, row)
+
+    def set_voxels(self, lattice: Lattice, keys: NDArray[np.uint32], witnesses: NDArray[np.uint8]) -> None:
+        """Obstacles, in the colour of how many units report each."""
+        stride = -(-max(len(keys), 1) // VOXELS_MAX)
+        centres = lattice.centres(lattice.indices(keys[::stride])).astype(np.float32)
+        colours = WITNESS_COLOURS[np.clip(witnesses[::stride].astype(np.int64) - 1, 0, 2)]
+        turns = np.tile(NO_TURN, (len(centres), 1))
+        if self._voxels is None or self._voxel_size_m != lattice.voxel_size_m:
+            self._voxel_size_m = lattice.voxel_size_m
+            vertices, faces = cube(lattice.voxel_size_m * VOXEL_SHARE)
+            self._voxels = self._server.scene.add_batched_meshes_simple(
+                "/obstacles",
+                vertices,
+                faces,
+                batched_wxyzs=turns,
+                batched_positions=centres,
+                batched_colors=colours,
+                lod="off",
+                flat_shading=True,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            return
+        with self._server.atomic():
+            self._voxels.batched_wxyzs = turns
+            self._voxels.batched_positions = centres
+            self._voxels.batched_colors = colours
+
+    def _body(self, name: str, body: PlacedMesh, colour: tuple[int, int, int]) -> Any:
+        return self._server.scene.add_mesh_simple(
+            name,
+            body.mesh.vertices,
+            body.mesh.faces.astype(np.uint32),
+            color=colour,
+            flat_shading=True,
+            side="double",
+            wxyz=wxyz_of(body.T_world_mesh),
+            position=body.T_world_mesh[:3, 3],
+        )
+
+    def _draw_camera(self, unit_id: int, row: dict[str, Any]) -> None:
+        pose = np.asarray(row["T_world_camera"])
+        state = row["state"]
+        for part in self._cameras.pop(unit_id, ()):
+            part.remove()
+        text = f"{unit_id}" if state == "live" else f"{unit_id} {state}"
+        self._cameras[unit_id] = (
+            self._server.scene.add_camera_frustum(
+                f"/cameras/{unit_id}",
+                fov=FOV_RAD,
+                aspect=ASPECT,
+                scale=FRUSTUM_M,
+                thickness=0.015,
+                color=STATE_COLOURS[state],
+                wxyz=wxyz_of(pose),
+                position=pose[:3, 3],
+            ),
+            self._server.scene.add_label(f"/labels/{unit_id}", text, position=pose[:3, 3] + (0.0, 0.0, 0.15)),
+        )
+
+
+class UnseenLayer:
+    """What no live unit looks through, for one who wants to see it."""
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        self._client = client
+        self._part: Any = None
+        self._drawn = b""
+
+    def show(self, seen_bits: bytes, blocks: Lattice) -> None:
+        """Draw it; `seen_bits` are one bit a block."""
+        if seen_bits == self._drawn:
+            return
+        self._drawn = seen_bits
+        count = blocks.cell_count
+        seen = np.unpackbits(np.frombuffer(seen_bits, np.uint8), count=count).astype(np.bool_).reshape(blocks.shape)
+        vertices, faces = surface(~seen, blocks)
+        self._take_out()
+        if len(faces):
+            self._part = self._client.scene.add_mesh_simple(
+                "/unseen",
+                vertices,
+                faces,
+                color=UNSEEN_COLOUR,
+                opacity=UNSEEN_OPACITY,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+
+    def hide(self) -> None:
+        """Draw it no more."""
+        self._drawn = b""
+        self._take_out()
+
+    def _take_out(self) -> None:
+        """Take out what is drawn."""
+        if self._part is not None:
+            self._part.remove()
+            self._part = None

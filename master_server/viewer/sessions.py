@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who may look, and who may change something: links that work once, and cookies.
+
+A browser sends no `Authorization` header of its own accord, and a token in an address ends up in histories and logs.
+So a link carries a code that works once, behind the `#` that browsers keep to themselves; the page hands it in and is
+given a cookie. The cookie is signed with the token that it stands for: it outlives a restart of the master, and is
+void as soon as that token is replaced.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import secrets
+from enum import Enum
+
+from master_server.access import Access, Role
+from shared.clock import NS_PER_S
+from shared.errors import Refusal
+
+LINK_S = 600
+"""A link is opened by whoever asked for it, at once; what is left in a terminal or a log is worth nothing."""
+
+LINKS_MAX = 16
+"""Links that were made and not opened; beyond, the oldest is void."""
+
+CODE_BYTES = 32
+
+SESSION_S = 12 * 3600
+"""A long shift; then the operator asks for a new link."""
+
+COOKIE_MAX_CHARS = 256
+"""Of a cookie, about three times what ours take."""
+
+
+class Viewer(Enum):
+    """What somebody in front of the window may do."""
+
+    READER = "reader"
+    OPERATOR = "operator"
+
+
+SIGNED_WITH = {Viewer.READER: Role.UNIT, Viewer.OPERATOR: Role.OPERATOR}
+
+
+def viewer_of(role: Role) -> Viewer:
+    """What the holder of a token may do: with the units' token, look."""
+    return Viewer.OPERATOR if role is Role.OPERATOR else Viewer.READER
+
+
+class Sessions:
+    """Links of one master and the cookies that they are exchanged for."""
+
+    def __init__(self, access: Access) -> None:
+        self._access = access
+        self._links: dict[str, int] = {}
+
+    def make_code(self, now_ns: int) -> str:
+        """The code of a link, with which somebody may once become an operator."""
+        while len(self._links) >= LINKS_MAX:
+            del self._links[next(iter(self._links))]
+        code = secrets.token_urlsafe(CODE_BYTES)
+        self._links[_digest(code)] = now_ns + LINK_S * NS_PER_S
+        return code
+
+    def redeem(self, code: str, now_ns: int) -> Viewer:
+        """Who opened the link with this code, which is worth nothing from now on.
+
+        Raises:
+            Refusal: 401, there is no such link, it was opened before or is too old.
+        """
+        expires_at_ns = self._links.pop(_digest(code), None)
+        if expires_at_ns is None or expires_at_ns <= now_ns:
+            raise Refusal(401, f"link: expected one that was not opened yet and is at most {LINK_S // 60} minutes old")
+        return Viewer.OPERATOR
+
+    def cookie(self, viewer: Viewer, wall_ns: int) -> str:
+        """What a browser is given to keep for `SESSION_S`."""
+        # By the wall clock: the monotonic one begins anew with the machine, and a cookie may outlive that.
+        expires_s = wall_ns // NS_PER_S + SESSION_S
+        return f"{viewer.value}.{expires_s}.{self._signature(viewer, expires_s)}"
+
+    def viewer(self, cookie: str, wall_ns: int) -> Viewer | None:
+        """Whose cookie it is; None for one that is not ours, or not any more."""
+        parts = cookie[:COOKIE_MAX_CHARS].split(".")
+        if len(parts) != 3 or not cookie.isascii():
+            return None
+        name, expires, signature = parts
+        viewer = next((one for one in Viewer if one.value == name), None)
+        if viewer is None or not expires.isdigit() or len(expires) > 12:
+            return None
+        if not hmac.compare_digest(signature, self._signature(viewer, int(expires))):
+            return None
+        return viewer if int(expires) * NS_PER_S > wall_ns else None
+
+    def _signature(self, viewer: Viewer, expires_s: int) -> str:
+        is_operators = SIGNED_WITH[viewer] is Role.OPERATOR
+        key = self._access.operator_token if is_operators else self._access.unit_token
+        return hmac.new(key, f"cellwatch viewer {viewer.value} {expires_s}".encode(), hashlib.sha256).hexdigest()
+
+
+def _digest(code: str) -> str:
+    """By which a code is found, so that how long it takes tells nothing of it."""
+    return hashlib.sha256(code.encode("utf-8", "surrogatepass")).hexdigest()

@@ -12,6 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 from blockbuster import BlockBuster
+from hypothesis import settings
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 SLOW_TIMEOUT_S = 600
@@ -22,6 +23,10 @@ EVENT_LOOP_TESTS = tuple(CHECKOUT / "tests" / package for package in ("edge_unit
 EVENT_LOOP_CODE = ("shared", "edge_unit", "master_server")
 # But for the rare change that must be on the disk before anything else happens; its docstring tells why.
 STORE_BLOCKS = {"in_memory", "load", "_transaction", "_put", "_put_cell", "_drop_meshes", "save_units"}
+
+# A busy machine is no fault of an example; where CI is set, hypothesis draws the same ones each time by itself.
+settings.register_profile("patient", settings(), deadline=None)
+settings.load_profile("patient")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -4,14 +4,17 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from numpy.typing import NDArray
 
 from master_server.merge import MergedMap
 from shared.lattice import Lattice
 
 LATTICE = Lattice((0.0, 0.0, 0.0), 0.1, (4, 5, 6))
+
+UNITS = st.integers(1, 4)
 
 
 def keys(*values: int) -> NDArray[np.uint32]:
@@ -83,3 +86,45 @@ def test_any_history_gives_what_counting_anew_gives(history: list[tuple[int, set
             merged.replace(unit_id, keys(*report))
             reports[unit_id] = report
         assert content(merged) == dict(Counter(key for keys_of in reports.values() for key in keys_of))
+
+
+class MergeMachine(RuleBasedStateMachine):
+    """The merged map beside a slow twin of plain sets."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.map = MergedMap(LATTICE)
+        self.twin: dict[int, set[int]] = {}
+        self.arrays: dict[int, NDArray[np.uint32]] = {}
+        self.revision = 0
+
+    @rule(unit=UNITS, keys=st.sets(st.integers(0, LATTICE.cell_count - 1), max_size=30))
+    def report(self, unit: int, keys: set[int]) -> None:
+        self.arrays[unit] = np.array(sorted(keys), np.uint32)
+        self.map.replace(unit, self.arrays[unit])
+        self.twin[unit] = keys
+        self.revision += 1
+
+    @rule(unit=UNITS)
+    def report_the_same_array(self, unit: int) -> None:
+        if unit in self.arrays:
+            self.map.replace(unit, self.arrays[unit])
+            self.revision += unit not in self.twin
+            self.twin[unit] = set(self.arrays[unit].tolist())
+
+    @rule(unit=UNITS)
+    def withdraw(self, unit: int) -> None:
+        self.map.withdraw(unit)
+        self.revision += self.twin.pop(unit, None) is not None
+
+    @invariant()
+    def says_what_the_sets_say(self) -> None:
+        keys, witnesses = self.map.voxels()
+        counts = Counter(key for reported in self.twin.values() for key in reported)
+        assert keys.tolist() == sorted(counts)
+        assert witnesses.tolist() == [counts[key] for key in sorted(counts)]
+        assert self.map.revision == self.revision
+
+
+TestMergeMachine = MergeMachine.TestCase
+TestMergeMachine.settings = settings(max_examples=60, stateful_step_count=30, deadline=None)

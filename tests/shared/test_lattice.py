@@ -232,3 +232,25 @@ def test_equal_lattices_are_equal() -> None:
     assert one.shape == (30, 30, 20)
     assert one == Lattice((np.float64(-1.5), -1.5, -0.2), 0.1, (30, 30, 20))
     assert len({one, Lattice(one.origin_m, one.voxel_size_m, one.shape)}) == 1
+
+
+@given(
+    st.tuples(*[st.integers(1, 500)] * 3).filter(lambda shape: np.prod(shape) <= MAX_CELLS),
+    st.data(),
+)
+def test_keys_and_indices_are_each_others_inverse_and_keys_ascend_as_indices_do(
+    shape: tuple[int, int, int], data: st.DataObject
+) -> None:
+    lattice = Lattice((0.0, 0.0, 0.0), 0.1, shape)
+    nx, ny, nz = shape
+    triples = data.draw(st.lists(st.tuples(*[st.integers(0, count - 1) for count in shape]), max_size=20))
+    indices = np.array(triples, np.int16).reshape(-1, 3)
+    keys = lattice.keys(indices)
+    assert keys.dtype == np.dtype("<u4")
+    assert keys.tolist() == [(ix * ny + iy) * nz + iz for ix, iy, iz in triples]
+    assert np.array_equal(lattice.indices(keys), indices)
+    by_key = sorted(range(len(triples)), key=keys.tolist().__getitem__)
+    assert [triples[number] for number in by_key] == sorted(triples)
+    for outside in (lattice.cell_count, 2**32 - 1):
+        with pytest.raises(InputError, match="key"):
+            lattice.indices(np.array([*keys.tolist(), outside], np.uint32))

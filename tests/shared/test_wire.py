@@ -4,6 +4,8 @@ from __future__ import annotations
 import random
 import sys
 import zlib
+from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import msgpack
@@ -19,9 +21,11 @@ from shared.messages import (
     MAX_VOXELS,
     Command,
     Health,
+    InitializeRequest,
     JointSample,
     LatticeDescription,
     Outcome,
+    RobotAnswer,
     SeenReport,
     UpdateAnswer,
     UpdateRequest,
@@ -296,3 +300,78 @@ def test_names_of_strangers_are_not_kept_for_ever() -> None:
     assert sys.intern(name) is name
     assert found == name
     assert found is not name
+
+
+TIMES = st.integers(0, 2**63 - 1)
+COUNTS = st.integers(0, 2**63 - 1)
+NUMBERS = st.floats(allow_nan=False, allow_infinity=False, width=32)
+VERSIONS = st.builds(Versions, settings=COUNTS, lattice=COUNTS, cell=COUNTS, pose=COUNTS)
+TEXTS = st.text(st.characters(exclude_categories=("Cs",)), max_size=200)
+UPDATES = st.builds(
+    UpdateRequest,
+    id=COUNTS,
+    session=COUNTS,
+    sequence=COUNTS,
+    captured_at_ns=st.none() | TIMES,
+    sent_at_ns=TIMES,
+    exchange=st.none() | st.builds(Exchange, TIMES, TIMES, TIMES, TIMES),
+    versions=VERSIONS,
+    keys=st.binary(max_size=80),
+    health=st.builds(Health, valid_share=st.floats(0.0, 1.0), frame=COUNTS, trouble=st.none() | TEXTS),
+    joints_until_ns=TIMES,
+    done=st.lists(st.builds(Outcome, COUNTS, TEXTS), max_size=3).map(tuple),
+)
+SAMPLES = st.builds(
+    JointSample,
+    TIMES,
+    st.lists(NUMBERS, min_size=1, max_size=7).map(tuple),
+    st.none() | st.lists(NUMBERS, min_size=1, max_size=7).map(tuple),
+)
+ANSWERS = st.builds(
+    UpdateAnswer,
+    versions=VERSIONS,
+    received_at_ns=TIMES,
+    answered_at_ns=TIMES,
+    joints=st.lists(SAMPLES, max_size=4).map(tuple),
+    settings=st.none() | st.just(Settings()),
+)
+NAMES = st.sampled_from([*UpdateRequest.model_fields, *UpdateAnswer.model_fields]) | st.text(max_size=3)
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5)
+    | st.binary(max_size=9),
+    lambda inner: st.lists(inner, max_size=12) | st.dictionaries(NAMES, inner, max_size=5),
+    max_leaves=20,
+)  # fmt: skip
+
+
+@given(UPDATES)
+def test_any_update_comes_back_as_it_went(sent: UpdateRequest) -> None:
+    assert decode_update(encode_update(sent)) == sent
+
+
+@given(ANSWERS)
+def test_any_answer_comes_back_as_it_went(sent: UpdateAnswer) -> None:
+    assert decode_update_answer(encode_update_answer(sent)) == sent
+
+
+@given(st.dictionaries(NAMES, PLAIN, max_size=8) | PLAIN)
+def test_only_wire_errors_come_out_of_any_values(fields: Any) -> None:
+    for read in (decode_update, decode_update_answer, partial(decode, InitializeRequest), partial(decode, RobotAnswer)):
+        with suppress(WireError):
+            read(msgpack.packb(fields))
+
+
+@given(st.binary(max_size=40), st.integers(0, 2**32))
+def test_any_bytes_are_keys_or_a_wire_error(data: bytes, cell_count: int) -> None:
+    with suppress(WireError):
+        keys = keys_from_bytes(data, cell_count)
+        assert keys.tobytes() == data
+        assert sorted(set(keys.tolist())) == keys.tolist()
+        assert all(key < cell_count for key in keys.tolist())
+
+
+@given(st.tuples(*[st.integers(1, 40)] * 3), st.binary(max_size=60), st.booleans())
+def test_any_bytes_are_a_seen_grid_or_a_wire_error(shape: tuple[int, int, int], bits: bytes, packed: bool) -> None:
+    with suppress(WireError):
+        report = SeenReport(block_size_m=0.1, shape=shape, bits=zlib.compress(bits) if packed else bits)
+        assert unpack_seen(report).shape == shape

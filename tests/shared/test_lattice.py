@@ -242,7 +242,7 @@ def test_keys_and_indices_are_each_others_inverse_and_keys_ascend_as_indices_do(
     shape: tuple[int, int, int], data: st.DataObject
 ) -> None:
     lattice = Lattice((0.0, 0.0, 0.0), 0.1, shape)
-    nx, ny, nz = shape
+    _, ny, nz = shape
     triples = data.draw(st.lists(st.tuples(*[st.integers(0, count - 1) for count in shape]), max_size=20))
     indices = np.array(triples, np.int16).reshape(-1, 3)
     keys = lattice.keys(indices)

@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps source-faults faults bench-pipeline bench-board bench-master bench-stance pictures test lint clean libusb
+.PHONY: help demo real sweeps right-time source-faults faults bench-pipeline bench-board bench-master bench-stance pictures test lint clean libusb
 
 ARGS ?=
 EXTRAS := edge,master,realsense,sim,dev
@@ -31,6 +31,9 @@ real: $(READY) ## the filter on recorded frames of a real cell (CELLWATCH_DATA n
 
 sweeps: $(READY) ## how thin, how small, how silent: the filter before simulated cameras
 	@$(BIN)/python -m benchmarks.sweeps $(ARGS)
+
+right-time: $(READY) ## joints that come late, jittering, seldom: the robot filtered where it was
+	@$(BIN)/python -m benchmarks.right_time $(ARGS)
 
 source-faults: $(READY) libusb ## a RealSense camera that hangs, dies and is unplugged: how long until frames flow again
 	@$(BIN)/python -m benchmarks.source_faults $(ARGS)

@@ -11,6 +11,8 @@ In the order of the flow:
     walkers    people in the simulated cell: how much of them is missed
     sweeps     all of these, as one table
     stance     how soon a knocked camera is told, and how often one that hangs still is suspected
+    joint_delivery a robot's joints as they reach the master: late, jittering, some lost
+    right_time the robot filtered where it was when the frame was taken
     board      how well a camera's pose is found by a calibration board
     real_frames the real recordings, and what must come out of them
     real         a real master and a real unit on them, judged frame by frame

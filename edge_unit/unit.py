@@ -396,7 +396,7 @@ class Unit:
         clock = self.uplink.clock
         if not clock.known:
             return None
-        at_ns = frame.captured_at_ns + clock.offset_ns
+        at_ns = frame.captured_at_ns + clock.offset_ns + round(assignment.settings.joint_delay_s * NS_PER_S)
         await self.uplink.refresh_joints(at_ns)
         uncertainty_ns = clock.uncertainty_ns(frame.captured_at_ns)
         return self.uplink.joints.at(at_ns, uncertainty_ns, assignment.settings.robot_stale_after_s)

@@ -18,7 +18,7 @@ from shared.settings import Settings
 from shared.timebase import Exchange
 from shared.transforms import Transform, validated
 
-CONTRACT_VERSION = 3
+CONTRACT_VERSION = 4
 """Rises when a unit of the old contract and a master of the new one can no longer work together."""
 
 MAX_TEXT = 200

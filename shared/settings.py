@@ -110,3 +110,10 @@ class Settings(FilterSettings):
         le=60.0,
         description="Joint positions older than this are no basis for a filter, in seconds.",
     )
+    joint_delay_s: float = Field(
+        default=0.0,
+        ge=-0.2,
+        le=0.2,
+        description="How much later the joints' times are than the moments at which the robot stood so, in seconds: of "
+        "joints without a time, how long they are under way. `edge-unit joint-delay` finds it.",
+    )

@@ -1,14 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the robot moves: each joint swings about its home on sinusoids, so that all derivatives exist."""
+"""How the robot moves: on sinusoids, so that all derivatives exist, or as fast as it can, with sharp reversals."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shared.errors import InputError
+
+
+class JointPath(Protocol):
+    """Where the joints are at any time; `home_rad` (n,) is where they swing about."""
+
+    @property
+    def home_rad(self) -> NDArray[np.float64]:
+        """(n,) rad."""
+        ...
+
+    def joints_at(self, t_s: float) -> NDArray[np.float64]:
+        """Joint positions (n,) in rad."""
+        ...
+
+    def velocities_at(self, t_s: float) -> NDArray[np.float64]:
+        """Joint velocities (n,) in rad/s."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +72,51 @@ class RobotPath:
 
     def _angles(self, t_s: float) -> NDArray[np.float64]:
         return np.asarray(self._rates() * (t_s % self.period_s) + self.phase_rad)
+
+
+@dataclass(frozen=True, eq=False)
+class ShuttlePath:
+    """Each joint goes to and fro between `home_rad - reach_rad` and `home_rad + reach_rad` at trapezoidal speed.
+
+    It speeds up at `acceleration_rad_s2`, goes on at `speed_rad_s`, slows down as hard, and turns back without a pause.
+    Arrays (n,); a joint without reach stands still.
+    """
+
+    home_rad: NDArray[np.float64]
+    reach_rad: NDArray[np.float64]
+    speed_rad_s: NDArray[np.float64]
+    acceleration_rad_s2: float
+
+    def joints_at(self, t_s: float) -> NDArray[np.float64]:
+        """Joint positions (n,) in rad."""
+        way, t, forth, ramp_s, stroke_s = self._stroke(t_s)
+        ramp = 0.5 * self.acceleration_rad_s2 * ramp_s
+        a = 0.5 * self.acceleration_rad_s2
+        gone = np.where(
+            t < ramp_s,
+            a * t**2,
+            np.where(t < stroke_s - ramp_s, ramp * (2.0 * t - ramp_s), way - a * (stroke_s - t) ** 2),
+        )
+        return np.asarray(self.home_rad + np.where(forth, gone - 0.5 * way, 0.5 * way - gone))
+
+    def velocities_at(self, t_s: float) -> NDArray[np.float64]:
+        """Joint velocities (n,) in rad/s."""
+        _, t, forth, ramp_s, stroke_s = self._stroke(t_s)
+        speed = self.acceleration_rad_s2 * np.minimum(np.minimum(t, stroke_s - t), ramp_s)
+        return np.asarray(np.where(forth, speed, -speed))
+
+    def _stroke(
+        self, t_s: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+        """Of each joint (n,): the way it goes, how far into it, whether forth, and the times of a ramp and a stroke."""
+        way = 2.0 * self.reach_rad
+        # Where the way is too short for full speed it is all ramps.
+        top = np.minimum(self.speed_rad_s, np.sqrt(way * self.acceleration_rad_s2))
+        ramp_s = top / self.acceleration_rad_s2
+        stroke_s = ramp_s + np.divide(way, top, out=np.ones_like(way), where=top > 0.0)
+        t = np.asarray(t_s % (2.0 * stroke_s))
+        forth = np.asarray(t < stroke_s)
+        return way, np.where(forth, t, t - stroke_s), forth, ramp_s, stroke_s
 
 
 _PERIOD_S = 6.0

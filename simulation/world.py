@@ -16,7 +16,7 @@ from shared.errors import InputError
 from shared.meshes import TriangleMesh, box_mesh
 from shared.transforms import Transform, from_rotation_translation
 from simulation.people import Loop, Person
-from simulation.robot_path import RobotPath
+from simulation.robot_path import JointPath, RobotPath
 from simulation.scene import Body, Capsules, Owner, Scene
 
 DEMO_CELL = Path(__file__).resolve().parent.parent / "assets" / "cells" / "demo" / "cell.yaml"
@@ -59,7 +59,7 @@ class World:
     """What really stands in the cell, as a pure function of time; `room` is what stands about it and never moves."""
 
     cell: Cell
-    robot_path: RobotPath | None = None
+    robot_path: JointPath | None = None
     people: tuple[Person, ...] = ()
     things: tuple[Thing, ...] = ()
     absences: tuple[Absence, ...] = ()

@@ -8,6 +8,7 @@ import contextlib
 import threading
 from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from master_server.master import Master
 from master_server.registry import Slot
 from shared.camera import Intrinsics
 from shared.cell import Board
-from shared.clock import monotonic_ns
+from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import SourceError
 from shared.messages import DONE, CommandRow, JointsRequest, Outcome, UnitRow, Verb
 from shared.settings import Settings
@@ -362,12 +363,51 @@ async def test_joints_of_the_frames_time_reach_the_pipeline(tmp_path: Path, monk
         bench.show(patch(FAR_MM))
         await bench.until(lambda: len(used) == 2, "a frame with joints")
         assert used[-1].positions[0] == pytest.approx(0.5)
-        assert used[-1].uncertainty[0] == 0.0
-        assert used[-1].uncertainty[1] > 0.0
+        assert used[-1].uncertainty[0] < used[-1].uncertainty[1]
         bench.source.joints = np.array([0.25, -0.25])
         bench.show(patch(FAR_MM))
         await bench.until(lambda: len(used) == 3, "a frame with joints of its own")
         assert used[-1].positions.tolist() == [0.25, -0.25]
+
+
+async def test_joints_whose_times_are_late_are_looked_up_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The robot turns at 1 rad/s; the delay is told while the unit runs."""
+    bench = await asyncio.to_thread(Bench, tmp_path, with_robot=True)
+    ahead_s: list[float | None] = []
+    report = unit_module.Unit._report
+    began_ns = monotonic_ns()
+
+    def turned(at_ns: int) -> float:
+        return (at_ns - began_ns) / NS_PER_S
+
+    def spy(unit: Any, pipeline: Any, assignment: Any, frame: Any, joints: Any) -> Any:
+        ahead_s.append(None if joints is None else joints.positions[1] - turned(frame.captured_at_ns))
+        return report(unit, pipeline, assignment, frame, joints)
+
+    def has_more_than(count: int) -> bool:
+        return len(ahead_s) > count
+
+    async def ahead() -> float:
+        """Of a frame for which joints are known: the first may come long after them, while kernels are compiled."""
+        while True:
+            count, at_ns = len(ahead_s), monotonic_ns()
+            request = JointsRequest(positions=(0.0, turned(at_ns)), velocities=(0.0, 1.0), at_ns=at_ns)
+            bench.master.put_joints(request, at_ns)
+            bench.show(patch(FAR_MM))
+            await bench.until(partial(has_more_than, count), "a frame")
+            if ahead_s[-1] is not None:
+                return ahead_s[-1]
+
+    monkeypatch.setattr(unit_module.Unit, "_report", spy)
+    async with bench.running():
+        assert await ahead() == pytest.approx(0.0, abs=0.005)
+        bench.master.change_settings({"joint_delay_s": 0.05})
+        version = bench.master.versions.settings
+        await bench.until(
+            lambda: bench.unit.uplink.assignment and bench.unit.uplink.assignment.versions.settings == version,
+            "the new settings",
+        )
+        assert await ahead() == pytest.approx(0.05, abs=0.005)
 
 
 async def test_joints_that_do_not_fit_are_a_trouble_and_no_end(tmp_path: Path) -> None:

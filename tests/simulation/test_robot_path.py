@@ -8,7 +8,7 @@ import pytest
 
 from shared.errors import InputError
 from shared.transforms import apply
-from simulation.robot_path import RobotPath
+from simulation.robot_path import RobotPath, ShuttlePath
 from simulation.world import World
 
 
@@ -60,3 +60,18 @@ def test_the_robot_stays_above_the_table_out_of_the_tray_and_below_a_metre_a_sec
     speed_m_s = np.linalg.norm(np.diff(tips, axis=0), axis=1) / step_s
     assert 0.3 < speed_m_s.mean() < 0.6
     assert 0.6 < speed_m_s.max() < 1.0
+
+
+def test_a_shuttle_goes_to_and_fro_at_trapezoidal_speed() -> None:
+    """The second joint's way is too short for full speed, the third has none."""
+    path = ShuttlePath(np.array((1.0, 0.0, 0.3)), np.array((0.5, 0.02, 0.0)), np.array((2.0, 2.0, 2.0)), 15.0)
+    times_s, step_s = np.arange(0.0, 5.0, 0.001), 1e-7
+    joints = np.array([path.joints_at(t_s) for t_s in times_s])
+    speeds = np.array([path.velocities_at(t_s) for t_s in times_s])
+    np.testing.assert_allclose(joints.min(axis=0), (0.5, -0.02, 0.3), atol=1e-4)
+    np.testing.assert_allclose(joints.max(axis=0), (1.5, 0.02, 0.3), atol=1e-4)
+    np.testing.assert_allclose(np.abs(speeds).max(axis=0), (2.0, np.sqrt(0.04 * 15.0), 0.0), atol=0.02)
+    assert np.abs(np.diff(speeds, axis=0)).max() <= 15.0 * 0.001 + 1e-9
+    for t_s in (0.01, 0.3, 0.7, 1.234, 4.9):
+        slope = (path.joints_at(t_s + step_s) - path.joints_at(t_s - step_s)) / (2.0 * step_s)
+        np.testing.assert_allclose(path.velocities_at(t_s), slope, atol=1e-4)

@@ -67,17 +67,18 @@ class Application(FastAPI):
         if scope["type"] == "lifespan":
             await super().__call__(scope, receive, send)
             return
+        scope["app"] = self
         # Before anything else, so that whom it refuses costs next to nothing.
         try:
             self.state.limits.admit(ip_of(scope), monotonic_ns())
         except Refusal as refusal:
+            log_refusal(scope, refusal)
             if scope["type"] == "http":
                 await refused(refusal)(scope, receive, send)
             else:
                 await send({"type": "websocket.close", "code": TRY_AGAIN_LATER, "reason": str(refusal)})
             return
         if scope["type"] == "http" and scope["path"] == "/update" and scope["method"] == "POST":
-            scope["app"] = self
             await self.update(scope, receive, send)
         else:
             await super().__call__(scope, receive, send)
@@ -103,7 +104,7 @@ def make_app(
     app = _assembled(Application, master, access, routers, recorder, limits)
     app.state.loader = CellLoader()
     app.state.pictures = Pictures(master.registry)
-    app.state.metrics = metrics = Metrics(master, app.state.stream)
+    app.state.metrics = metrics = Metrics(master, app.state.stream, app.state.limits)
     app.state.started_at_ns = monotonic_ns()
     app.take_updates(UpdateEndpoint(master, metrics))
     return app

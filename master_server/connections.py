@@ -118,10 +118,13 @@ class Acceptor:
                 logger.warning("cannot take a connection in: %s", error)
                 await asyncio.sleep(ACCEPT_AGAIN_S)
                 continue
-            ip = plain_ip(str(address[0]))
-            if self._limits.connect(ip, monotonic_ns()):
+            ip, now_ns = plain_ip(str(address[0])), monotonic_ns()
+            if self._limits.connect(ip, now_ns):
                 self._begin(self._shake_hands(connection, ip))
             else:
+                if self._limits.may_be_logged(ip, now_ns):
+                    text = "a connection of %s is turned away, %d are open"
+                    logger.warning(text, ip, self._limits.connections, extra={"event": "connection", "ip": ip})
                 # Reset, so that nothing of it is kept waiting on our side.
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
                 connection.close()

@@ -87,6 +87,8 @@ class Limits:
         self._trusted_at_ns: dict[str, int] = {}
         self._open: dict[str, int] = {}
         self._open_count = 0
+        self.turned_away = {"request": 0, "token": 0, "connection": 0}
+        """How many of each were, since the start."""
 
     def admit(self, ip: str, now_ns: int) -> None:
         """Count a request.
@@ -96,6 +98,7 @@ class Limits:
         """
         wait_ns = self.requests.wait_ns(ip, now_ns)
         if wait_ns > 0:
+            self.turned_away["request"] += 1
             raise _too_many(f"requests: expected at most {REQUESTS_PER_S:g} a second from {ip}, got more", wait_ns)
         self.requests.spend(ip, now_ns)
 
@@ -118,6 +121,7 @@ class Limits:
         """
         wait_ns = self.wrong_tokens.wait_ns(ip, now_ns)
         if wait_ns > 0 and not self._is_trusted(ip, now_ns):
+            self.turned_away["token"] += 1
             raise _too_many(f"token: {ip} has shown too many wrong ones", wait_ns)
 
     def token_was_wrong(self, ip: str, now_ns: int) -> None:
@@ -132,9 +136,12 @@ class Limits:
         """Whether this address may have one more connection; if so it is counted until `disconnect`."""
         open_here = self._open.get(ip, 0)
         open_max = CONNECTIONS_MAX if self._is_trusted(ip, now_ns) else STRANGERS_MAX
-        if open_here >= CONNECTIONS_PER_ADDRESS or self._open_count >= open_max:
-            return False
-        if self.new_connections.wait_ns(ip, now_ns) > 0:
+        if (
+            open_here >= CONNECTIONS_PER_ADDRESS
+            or self._open_count >= open_max
+            or self.new_connections.wait_ns(ip, now_ns) > 0
+        ):
+            self.turned_away["connection"] += 1
             return False
         self.new_connections.spend(ip, now_ns)
         self._open[ip] = open_here + 1

@@ -17,6 +17,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.registry import Collector
 
 from master_server.answers import coverage_shares
+from master_server.limits import Limits
 from master_server.master import Master
 from master_server.stream import Stream
 from shared.clock import NS_PER_S, monotonic_ns
@@ -34,9 +35,10 @@ UNIT = ("unit", "ip")
 class Metrics(Collector):
     """All series of one master, in a registry of their own."""
 
-    def __init__(self, master: Master, stream: Stream) -> None:
+    def __init__(self, master: Master, stream: Stream, limits: Limits) -> None:
         self._master = master
         self._stream = stream
+        self._limits = limits
         self._took = [0] * (len(BOUNDS_S) + 1)
         self._took_ns = 0
         self._refused: dict[int, int] = {}
@@ -107,6 +109,13 @@ class Metrics(Collector):
         for status, count in sorted(self._refused.items()):
             refused.add_metric((str(status),), count)
         yield refused
+        turned_away = CounterMetricFamily(
+            "cellwatch_turned_away", "Beyond what one address, or all, may ask for.", labels=("what",)
+        )
+        for what, count in self._limits.turned_away.items():
+            turned_away.add_metric((what,), count)
+        yield turned_away
+        yield GaugeMetricFamily("cellwatch_connections", "That are open.", self._limits.connections)
 
     def _map(self, now_ns: int) -> Iterator[Metric]:
         view = self._master.view(now_ns)

@@ -150,7 +150,9 @@ def test_an_address_has_one_name() -> None:
     assert plain_ip("::ffff:10.0.0.1") == plain_ip("10.0.0.1")
 
 
-async def test_too_many_requests_are_told_when_to_come_again(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_too_many_requests_are_told_when_to_come_again(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setattr(limits_module, "REQUESTS_BURST", 5)
     monkeypatch.setattr(limits_module, "REQUESTS_PER_S", 0.1)
     desk = Desk(make_app(master(), Access(UNIT.encode(), OPERATOR.encode())))
@@ -162,7 +164,14 @@ async def test_too_many_requests_are_told_when_to_come_again(monkeypatch: pytest
         assert refused.status_code == 429
         assert 0 < int(refused.headers["retry-after"]) <= 10
         assert refused.json()["detail"].startswith("requests: expected at most")
+        assert f"{method} {path} from {ip} refused: 429, requests" in caplog.text
     assert (await desk.call("GET", "/units", ip="10.0.2.1")).status_code == 200
+    for _ in range(5 * limits_module.COMPLAINTS_BURST):
+        await desk.call("GET", "/units", ip="10.0.2.1")
+    assert 0 < caplog.text.count("from 10.0.2.1 refused") <= limits_module.COMPLAINTS_BURST + 5
+    told = (await desk.call("GET", "/metrics", ip="10.0.2.2")).text
+    away = 3 + 5 * limits_module.COMPLAINTS_BURST - 4
+    assert f'cellwatch_turned_away_total{{what="request"}} {away:.1f}' in told
 
 
 @pytest.mark.parametrize(("method", "path"), [("GET", "/units"), ("PUT", "/settings"), ("POST", "/update")])

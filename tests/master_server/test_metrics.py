@@ -2,16 +2,19 @@
 from __future__ import annotations
 
 import importlib.metadata
+from contextlib import suppress
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from master_server.limits import CONNECTIONS_PER_ADDRESS, REQUESTS_BURST, Limits
 from master_server.metrics import Metrics
 from master_server.registry import MAX_UNITS
 from master_server.stream import Stream
 from shared.clock import NS_PER_US, monotonic_ns
+from shared.errors import Refusal
 from shared.messages import JointsRequest
-from tests.master_server.fakes import MS, FakeUnit, S, joined, master, sees_all
+from tests.master_server.fakes import MS, START_NS, FakeUnit, S, joined, master, sees_all
 
 
 def samples(metrics: Metrics) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
@@ -26,7 +29,7 @@ def samples(metrics: Metrics) -> dict[tuple[str, frozenset[tuple[str, str]]], fl
 
 def test_all_that_a_unit_is_told_by() -> None:
     one = master(with_robot=True)
-    metrics = Metrics(one, Stream(one))
+    metrics = Metrics(one, Stream(one), Limits())
     unit = joined(one, 1, monotonic_ns())
     unit.update(monotonic_ns(), [1, 2, 3], seen=sees_all(one), age_ns=40 * MS)
     metrics.accepted(unit.initialized.id, 100, 300 * NS_PER_US)
@@ -64,7 +67,7 @@ def test_all_that_a_unit_is_told_by() -> None:
 
 def test_series_of_a_deleted_unit_vanish() -> None:
     one = master()
-    metrics = Metrics(one, Stream(one))
+    metrics = Metrics(one, Stream(one), Limits())
     gone, kept = joined(one, 1), joined(one, 2)
     metrics.accepted(gone.initialized.id, 1, 1)
     assert any(("unit", "1") in labels for _, labels in samples(metrics))
@@ -76,21 +79,38 @@ def test_series_of_a_deleted_unit_vanish() -> None:
 def test_what_a_unit_calls_itself_breaks_no_line() -> None:
     one = master()
     FakeUnit(one, serial='a"} 7\\').initialize()
-    assert any(("serial", 'a"} 7\\') in labels for _, labels in samples(Metrics(one, Stream(one))))
+    assert any(("serial", 'a"} 7\\') in labels for _, labels in samples(Metrics(one, Stream(one), Limits())))
 
 
 def test_refusals_by_status() -> None:
     one = master()
-    metrics = Metrics(one, Stream(one))
+    metrics = Metrics(one, Stream(one), Limits())
     for status in (409, 401, 409):
         metrics.refused(status)
     refused = {dict(labels)["status"]: count for (name, labels), count in samples(metrics).items() if "refused" in name}
     assert refused == {"401": 1.0, "409": 2.0}
 
 
+def test_what_was_turned_away_and_what_is_open() -> None:
+    one, limits = master(), Limits()
+    metrics = Metrics(one, Stream(one), limits)
+    for _ in range(REQUESTS_BURST + 3):
+        with suppress(Refusal):
+            limits.admit("10.0.0.1", START_NS)
+    for _ in range(CONNECTIONS_PER_ADDRESS + 2):
+        limits.connect("10.0.0.1", START_NS)
+    found = samples(metrics)
+    assert {dict(labels)["what"]: count for (name, labels), count in found.items() if "turned_away_total" in name} == {
+        "request": 3.0,
+        "token": 0.0,
+        "connection": 2.0,
+    }
+    assert found["cellwatch_connections", frozenset()] == CONNECTIONS_PER_ADDRESS
+
+
 def test_counting_is_cheap_and_so_is_a_full_house() -> None:
     one = master()
-    metrics = Metrics(one, Stream(one))
+    metrics = Metrics(one, Stream(one), Limits())
     for number in range(MAX_UNITS):
         joined(one, number, monotonic_ns()).update(monotonic_ns(), [number], seen=sees_all(one))
     rounds, began_ns = 10_000, monotonic_ns()

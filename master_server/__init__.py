@@ -4,6 +4,7 @@
 In the order of the flow:
 
     logs         lines of the log: text or JSON, without secrets, none without end
+    tokens       the files of the two tokens
     access       who may do what: two tokens
     limits       how much one address may ask for
     published    the cell as it is given to units and operators

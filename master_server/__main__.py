@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`master-server --cell CELL.YAML`: serve one cell until told to stop.
 
-`master-server replay FILE` serves a recording in its place, `master-server recording-info FILE` tells what is in one.
+`master-server replay FILE` serves a recording in its place, `master-server recording-info FILE` tells what is in one,
+`master-server new-token unit` replaces a token.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import Any, get_args
 
 import uvicorn
 
-from master_server.access import Access, Role, load_access, token_file
+from master_server.access import Access, load_access
 from master_server.app import Application, add_viewer, make_app, make_replay_app
 from master_server.config import ENVIRONMENT_PREFIX, MasterConfig, ReplayConfig, ServerConfig
 from master_server.connections import Acceptor, GuardedHttp, fingerprint, quiet, server_context
@@ -35,6 +36,7 @@ from master_server.recorded import Progress, Recording, summary
 from master_server.recording import Recorder
 from master_server.replay import Replay
 from master_server.store import FILE_NAME, Store
+from master_server.tokens import Role, token_file, write_token
 from master_server.viewer.host import is_installed
 from master_server.viewer.proxy import PAGE, Gate, link_path
 from master_server.viewer.sessions import LINK_S
@@ -187,6 +189,11 @@ def _tell_recording(options: argparse.Namespace) -> None:
         print("\n".join(summary(recording)))
 
 
+def _replace_token(options: argparse.Namespace) -> None:
+    path = write_token(options.state_dir, Role(options.role))
+    print(f"master-server: the new token of the {options.role} lies in {path}; a master that runs on it takes it now")
+
+
 def _progress(file: Path) -> Progress | None:
     """Tell a person how far the reading of a file is."""
     if not sys.stderr.isatty():
@@ -293,7 +300,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="master-server",
         description="The master that all edge units post to.",
         epilog=f"Every option may also be a variable, as in {ENVIRONMENT_PREFIX}PORT=9000; flags win over variables, "
-        "and those over the file. See also `master-server replay --help` and `master-server recording-info --help`.",
+        "and those over the file. Commands with a --help of their own: replay, recording-info, new-token.",
     )
     parser.set_defaults(run=_serve_master)
     parser.add_argument("--config", type=Path, metavar="YAML", help="configuration file")
@@ -330,6 +337,18 @@ def _info_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _token_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="master-server new-token",
+        description="Replace a token: a master that runs refuses the one before within a second, and ends streams that "
+        "were opened with it. The token itself is printed nowhere.",
+    )
+    parser.set_defaults(run=_replace_token)
+    parser.add_argument("role", choices=[role.value for role in Role], help="whose token")
+    parser.add_argument("--state-dir", type=Path, metavar="DIR", required=True, help="that of the master")
+    return parser
+
+
 def _add_server_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", help="address to listen at (default: all)")
     parser.add_argument("--port", type=int, help="port to listen at, 0 for a free one (default: 8420)")
@@ -360,7 +379,7 @@ def _seconds(text: str) -> float:
         raise argparse.ArgumentTypeError(f"expected a time as in 30s, 5m or 1h, got {text}") from error
 
 
-PARSERS = {"replay": _replay_parser, "recording-info": _info_parser}
+PARSERS = {"replay": _replay_parser, "recording-info": _info_parser, "new-token": _token_parser}
 
 
 if __name__ == "__main__":

@@ -1,52 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who may do what: one token for units, one for operators.
-
-Both are made at the first start, kept in files that only the master's user can read, and never logged.
-"""
+"""Who may do what: one token for units, one for operators, each for as long as it stands in its file."""
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import logging
-import os
-import secrets
-from dataclasses import dataclass
-from enum import Enum
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from master_server.tokens import TOKEN_MAX_CHARS, Role, make_missing, read_token, token_file
 from shared.errors import ConfigError, Refusal
 
 logger = logging.getLogger(__name__)
 
-TOKEN_BYTES = 32
-"""256 bits of randomness: nobody guesses it, whatever the rate."""
-
-TOKEN_MIN_CHARS = 16
-"""Shorter is an accident with an editor, not a token."""
-
-TOKEN_MAX_CHARS = 256
-"""Longer than any token; bounds what is compared."""
-
-
-class Role(Enum):
-    """Whose token it is."""
-
-    UNIT = "unit"
-    OPERATOR = "operator"
-
+LOOK_EVERY_S = 0.1
+"""How often the tokens' files are read again: whoever replaces one wants the old one refused, and at 50 us in a thread
+it costs no request anything."""
 
 UNITS = frozenset({Role.UNIT})
 OPERATORS = frozenset({Role.OPERATOR})
 ANYONE = frozenset({Role.UNIT, Role.OPERATOR})
 
 
-@dataclass(frozen=True)
+@dataclass
 class Access:
-    """The two tokens, and whether reading needs one at all."""
+    """The two tokens, and whether reading needs one at all.
 
-    unit_token: bytes
-    operator_token: bytes
+    Attributes:
+        state_dir: the folder with the files of the tokens, for `follow`.
+    """
+
+    unit_token: bytes = field(repr=False)
+    operator_token: bytes = field(repr=False)
     public_reads: bool = False
+    state_dir: Path | None = None
+    _ends: dict[Role, asyncio.Event] = field(
+        default_factory=lambda: {role: asyncio.Event() for role in Role}, init=False, repr=False, compare=False
+    )
 
     def check(self, authorization: bytes | None, allowed: frozenset[Role]) -> Role:
         """The role of a request with this `Authorization` header.
@@ -76,10 +67,52 @@ class Access:
         if not self.public_reads:
             self.check(authorization, ANYONE)
 
+    def token_of(self, role: Role) -> bytes:
+        """The token of a role, as it is now."""
+        return self.unit_token if role is Role.UNIT else self.operator_token
 
-def token_file(state_dir: Path, role: Role) -> Path:
-    """Where the token of a role lies."""
-    return state_dir / f"{role.value}.token"
+    def end_of(self, role: Role) -> asyncio.Event:
+        """Set once the token that this role has now is replaced."""
+        return self._ends[role]
+
+    def replace(self, role: Role, token: bytes) -> None:
+        """From now on this is the token of the role, and the one before is refused."""
+        if role is Role.UNIT:
+            self.unit_token = token
+        else:
+            self.operator_token = token
+        ended, self._ends[role] = self._ends[role], asyncio.Event()
+        ended.set()
+
+    async def follow(self) -> None:
+        """Take over each token whose file is replaced, until cancelled.
+
+        While a file is missing or holds no token, the one before stays.
+        """
+        if self.state_dir is None:
+            return
+        seen: dict[Role, str] = {}
+        told: dict[Role, str] = {}
+        while True:
+            await asyncio.sleep(LOOK_EVERY_S)
+            for role, found in (await asyncio.to_thread(_look, self.state_dir)).items():
+                if isinstance(found, bytes):
+                    seen.pop(role, None)
+                    told.pop(role, None)
+                    if found != self.token_of(role):
+                        self.replace(role, found)
+                        logger.info(
+                            "%s was replaced: the token before is refused from now on",
+                            token_file(self.state_dir, role),
+                            extra={"event": "token"},
+                        )
+                    continue
+                trouble = str(found)
+                # Only at the second look, for who writes a file in place empties it first.
+                if seen.get(role) == trouble and told.get(role) != trouble:
+                    logger.warning("%s; the token before stays in force", trouble, extra={"event": "token"})
+                    told[role] = trouble
+                seen[role] = trouble
 
 
 def load_access(state_dir: Path, public_reads: bool) -> Access:
@@ -88,39 +121,16 @@ def load_access(state_dir: Path, public_reads: bool) -> Access:
     Raises:
         ConfigError: the folder or a file cannot be read or written, or a file holds no token.
     """
-    try:
-        state_dir.mkdir(parents=True, exist_ok=True, mode=0o700)
-    except OSError as error:
-        raise ConfigError(f"{state_dir}: cannot make the folder for tokens: {error.strerror}") from error
-    return Access(_token(state_dir, Role.UNIT), _token(state_dir, Role.OPERATOR), public_reads)
+    make_missing(state_dir)
+    return Access(read_token(state_dir, Role.UNIT), read_token(state_dir, Role.OPERATOR), public_reads, state_dir)
 
 
-def _token(state_dir: Path, role: Role) -> bytes:
-    path = token_file(state_dir, role)
-    try:
-        if not path.exists():
-            _write_private(path, secrets.token_urlsafe(TOKEN_BYTES))
-            logger.info("made the %s token in %s", role.value, path)
-        elif path.stat().st_mode & 0o077:
-            logger.warning("%s can be read by others: closing it (mode 0600)", path)
-            path.chmod(0o600)
-        token = path.read_bytes().strip()
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot read or make the {role.value} token: {error.strerror}") from error
-    if not TOKEN_MIN_CHARS <= len(token) <= TOKEN_MAX_CHARS or not token.isascii():
-        raise ConfigError(
-            f"{path}: expected a token of {TOKEN_MIN_CHARS} to {TOKEN_MAX_CHARS} ASCII characters, "
-            f"got {len(token)} bytes; delete the file to have a new one made"
-        )
-    return token
-
-
-def _write_private(path: Path, text: str) -> None:
-    """Write whole or not at all, readable by nobody else at any moment."""
-    partial = path.with_suffix(".partial")
-    partial.unlink(missing_ok=True)
-    with os.fdopen(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-        file.write(text + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+def _look(state_dir: Path) -> dict[Role, bytes | ConfigError]:
+    """What stands in the files now, or why that is no token."""
+    found: dict[Role, bytes | ConfigError] = {}
+    for role in Role:
+        try:
+            found[role] = read_token(state_dir, role)
+        except ConfigError as error:
+            found[role] = error
+    return found

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -141,11 +142,13 @@ def _assembled(
         # Now, while nobody waits for it.
         app.openapi()
         listeners.start()
+        following = asyncio.create_task(access.follow())
         if recorder is not None and recorder.enabled:
             await recorder.begin()
         try:
             yield
         finally:
+            following.cancel()
             listeners.stop()
             if app.state.viewer is not None:
                 await app.state.viewer.host.close()

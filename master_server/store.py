@@ -26,6 +26,7 @@ from pydantic import ValidationError
 from shared.cell import Cell
 from shared.configuration import sentence
 from shared.errors import CellError, ConfigError, Refusal
+from shared.files import sync_folder
 from shared.messages import Counter, Matrix, Message, PoseOrigin, Versions
 from shared.settings import Settings
 
@@ -274,19 +275,6 @@ class Store:
             if self.trouble is not None:
                 logger.info("changes can be stored again", extra={"event": "storage"})
             self.trouble = None
-
-
-def sync_folder(folder: Path) -> None:
-    """Have the names of a folder's files on the disk, as fsync has their content.
-
-    Raises:
-        OSError: it cannot be opened, or the disk fails.
-    """
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _make(path: Path) -> None:

@@ -19,6 +19,9 @@ UNSENT_MAX_BYTES = 2**14
 PING_S = 5.0
 """A reader that is gone, or does not read, is let go after two of these at most."""
 
+CLOSE_S = 0.5
+"""For a reader to hear that it is let go; whoever does not read is let go without."""
+
 MESSAGE_MAX_BYTES = 2**12
 """Readers have nothing to say but that they go."""
 
@@ -41,6 +44,11 @@ class ReaderSocket(WebSocketsSansIOProtocol):
         if self.leave is not None:
             self.leave()
         super().connection_lost(exc)
+
+    async def send(self, message: Any) -> None:
+        if message["type"] == "websocket.close":
+            self.loop.call_later(CLOSE_S, self.transport.abort)
+        await super().send(message)
 
     def keepalive_timeout(self) -> None:
         super().keepalive_timeout()

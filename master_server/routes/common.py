@@ -16,11 +16,12 @@ from starlette.requests import ClientDisconnect, HTTPConnection
 from starlette.responses import JSONResponse
 from starlette.types import Message, Scope
 
-from master_server.access import ANYONE, OPERATORS, UNITS, Access, Role
+from master_server.access import ANYONE, OPERATORS, UNITS, Access
 from master_server.limits import Limits, plain_ip
 from master_server.master import Master
 from master_server.readable import Readable
 from master_server.replay import Replay
+from master_server.tokens import Role
 from shared.clock import monotonic_ns
 from shared.errors import CellwatchError, Refusal, WireError
 from shared.waiting import at_once_or_within, within

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from contextlib import suppress
 from typing import Literal
 
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
+from fastapi.websockets import WebSocketState
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from master_server.access import ANYONE
@@ -29,6 +31,9 @@ SUBPROTOCOL = "cellwatch"
 """What the master agrees to: a browser wants one of those that it offered, and the token must not come back."""
 
 BEARER = "bearer."
+
+TOKEN_REPLACED = 1008
+"""What a stream is closed with whose token holds no more: a policy, says RFC 6455."""
 
 
 class StreamQuery(BaseModel):
@@ -48,8 +53,11 @@ async def stream(websocket: WebSocket) -> None:
     assert isinstance(source, Stream)
     try:
         _refuse_token(websocket)
-        if not access_of(websocket).public_reads:
-            role_of(websocket, ANYONE, _authorization(websocket))
+        access = access_of(websocket)
+        # A public stream was opened with no token that could be replaced.
+        token_ended = asyncio.Event()
+        if not access.public_reads:
+            token_ended = access.end_of(role_of(websocket, ANYONE, _authorization(websocket)))
         listener = source.listen(_wish(websocket))
     except Refusal as refusal:
         log_refusal(websocket.scope, refusal)
@@ -59,13 +67,17 @@ async def stream(websocket: WebSocket) -> None:
     with listener:
         await websocket.accept(SUBPROTOCOL if SUBPROTOCOL in websocket.scope["subprotocols"] else None)
         logger.info("reader %s listens (%d in all)", fields["ip"], len(source), extra=fields)
-        tasks = [asyncio.ensure_future(_send(websocket, listener)), asyncio.ensure_future(_until_gone(websocket))]
+        works = (_send(websocket, listener), _until_gone(websocket), token_ended.wait())
+        tasks: list[asyncio.Task[object]] = [asyncio.ensure_future(work) for work in works]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
             for task in tasks:
                 task.cancel()
             ended = await asyncio.gather(*tasks, return_exceptions=True)
+    if token_ended.is_set() and websocket.application_state is WebSocketState.CONNECTED:
+        with suppress(WebSocketDisconnect):
+            await websocket.close(TOKEN_REPLACED, "the token was replaced")
     logger.info(
         "reader %s is gone: %d messages sent, %d skipped", fields["ip"], listener.sent, listener.skipped, extra=fields
     )

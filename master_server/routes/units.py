@@ -7,7 +7,6 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path, Request
 
-from master_server.access import Role
 from master_server.routes.common import (
     OPERATOR_ONLY,
     READERS,
@@ -19,6 +18,7 @@ from master_server.routes.common import (
     ip_of,
     is_known,
 )
+from master_server.tokens import Role
 from shared.clock import monotonic_ns
 from shared.messages import Command, InitializeAnswer, InitializeRequest, PoseAnswer, PoseRequest, UnitRow
 

@@ -12,6 +12,7 @@ import base64
 import gzip
 import hashlib
 import logging
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,14 @@ from urllib.parse import urlsplit
 
 import msgpack
 from fastapi import APIRouter, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi.websockets import WebSocketState
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import HTTPConnection
 from starlette.responses import RedirectResponse
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
-from master_server.access import ANYONE, TOKEN_MAX_CHARS
+from master_server.access import ANYONE
 from master_server.routes.common import (
     OPERATOR_ONLY,
     access_of,
@@ -35,8 +37,10 @@ from master_server.routes.common import (
     refused,
     role_of,
 )
+from master_server.routes.stream import TOKEN_REPLACED
+from master_server.tokens import TOKEN_MAX_CHARS
 from master_server.viewer.host import ViewerHost
-from master_server.viewer.sessions import SESSION_S, Sessions, Viewer, viewer_of
+from master_server.viewer.sessions import SESSION_S, SIGNED_WITH, Sessions, Viewer, viewer_of
 from shared.clock import monotonic_ns, wall_ns
 from shared.errors import Refusal
 
@@ -244,6 +248,7 @@ async def window(websocket: WebSocket) -> None:
         viewer = _viewer_of(websocket)
         if viewer is None:
             raise Refusal(401, "viewer: expected the cookie of a login, or a token")
+        token_ended = access_of(websocket).end_of(SIGNED_WITH[viewer])
         if gate.looking >= VIEWERS_MAX:
             raise Refusal(503, f"viewer: {VIEWERS_MAX} look already")
         await gate.host.open()
@@ -255,7 +260,7 @@ async def window(websocket: WebSocket) -> None:
     gate.looking += 1
     try:
         logger.info("viewer: %s looks as %s (%d in all)", fields["ip"], viewer.value, gate.looking, extra=fields)
-        await _pass_on(websocket, gate.host, viewer)
+        await _pass_on(websocket, gate.host, viewer, token_ended)
     except (OSError, InvalidHandshake) as error:
         logger.warning("viewer: its process does not answer: %s", error, extra=fields)
         await websocket.close(UNAVAILABLE)
@@ -271,7 +276,7 @@ def _refuse_other_pages(connection: HTTPConnection) -> None:
         raise Refusal(403, "viewer: expected a request of the master's own page, got one of another")
 
 
-async def _pass_on(websocket: WebSocket, host: ViewerHost, viewer: Viewer) -> None:
+async def _pass_on(websocket: WebSocket, host: ViewerHost, viewer: Viewer, token_ended: asyncio.Event) -> None:
     async with connect(
         f"ws://127.0.0.1:{host.port}/",
         subprotocols=websocket.scope["subprotocols"] or None,
@@ -284,13 +289,17 @@ async def _pass_on(websocket: WebSocket, host: ViewerHost, viewer: Viewer) -> No
         proxy=None,
     ) as inner:
         await websocket.accept(inner.subprotocol)
-        tasks = [asyncio.ensure_future(_up(websocket, inner)), asyncio.ensure_future(_down(websocket, inner))]
+        works = (_up(websocket, inner), _down(websocket, inner), token_ended.wait())
+        tasks: list[asyncio.Task[object]] = [asyncio.ensure_future(work) for work in works]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
             for task in tasks:
                 task.cancel()
             ended = await asyncio.gather(*tasks, return_exceptions=True)
+    if token_ended.is_set() and websocket.application_state is WebSocketState.CONNECTED:
+        with suppress(WebSocketDisconnect):
+            await websocket.close(TOKEN_REPLACED, "the token was replaced")
     for outcome in ended:
         if isinstance(outcome, Exception) and not isinstance(outcome, (WebSocketDisconnect, ConnectionClosed)):
             raise outcome

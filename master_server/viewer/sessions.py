@@ -4,7 +4,7 @@
 A browser sends no `Authorization` header of its own accord, and a token in an address ends up in histories and logs.
 So a link carries a code that works once, behind the `#` that browsers keep to themselves; the page hands it in and is
 given a cookie. The cookie is signed with the token that it stands for: it outlives a restart of the master, and is
-void as soon as that token is replaced.
+void as soon as that token is replaced, as are links that were not opened yet.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ import hmac
 import secrets
 from enum import Enum
 
-from master_server.access import Access, Role
+from master_server.access import Access
+from master_server.tokens import Role
 from shared.clock import NS_PER_S
 from shared.errors import Refusal
 
@@ -60,7 +61,7 @@ class Sessions:
         while len(self._links) >= LINKS_MAX:
             del self._links[next(iter(self._links))]
         code = secrets.token_urlsafe(CODE_BYTES)
-        self._links[_digest(code)] = now_ns + LINK_S * NS_PER_S
+        self._links[self._digest(code)] = now_ns + LINK_S * NS_PER_S
         return code
 
     def redeem(self, code: str, now_ns: int) -> Viewer:
@@ -69,7 +70,7 @@ class Sessions:
         Raises:
             Refusal: 401, there is no such link, it was opened before or is too old.
         """
-        expires_at_ns = self._links.pop(_digest(code), None)
+        expires_at_ns = self._links.pop(self._digest(code), None)
         if expires_at_ns is None or expires_at_ns <= now_ns:
             raise Refusal(401, f"link: expected one that was not opened yet and is at most {LINK_S // 60} minutes old")
         return Viewer.OPERATOR
@@ -98,7 +99,6 @@ class Sessions:
         key = self._access.operator_token if is_operators else self._access.unit_token
         return hmac.new(key, f"cellwatch viewer {viewer.value} {expires_s}".encode(), hashlib.sha256).hexdigest()
 
-
-def _digest(code: str) -> str:
-    """By which a code is found, so that how long it takes tells nothing of it."""
-    return hashlib.sha256(code.encode("utf-8", "surrogatepass")).hexdigest()
+    def _digest(self, code: str) -> str:
+        """By which a code is found, so that how long it takes tells nothing of it, and only while the token holds."""
+        return hmac.new(self._access.operator_token, code.encode("utf-8", "surrogatepass"), hashlib.sha256).hexdigest()

@@ -1,13 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import asyncio
 import logging
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
 
-from master_server.access import ANYONE, OPERATORS, UNITS, Access, Role, load_access, token_file
-from shared.errors import ConfigError, Refusal
+from master_server import access as access_module
+from master_server.access import ANYONE, LOOK_EVERY_S, OPERATORS, UNITS, Access, load_access
+from master_server.tokens import Role, token_file, write_token
+from shared.errors import Refusal
+from shared.waiting import within
 
 ACCESS = Access(b"unit-token-0123456789", b"operator-token-0123456789")
 
@@ -50,38 +56,105 @@ def test_reading_needs_a_token_unless_it_is_public() -> None:
     Access(b"a" * 20, b"b" * 20, public_reads=True).check_read(None)
 
 
-def test_tokens_are_made_once_for_nobody_else_and_never_logged(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_a_token_stands_in_no_text_about_it() -> None:
+    assert ACCESS.unit_token.decode() not in repr(ACCESS)
+    assert ACCESS.operator_token.decode() not in repr(ACCESS)
+
+
+# ---------------------------------------------------------------------- files that are replaced
+
+NEW = b"another-token-0123456789"
+COUNTS_WITHIN_S = 1.0
+
+
+@pytest.fixture
+def access(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Access:
+    monkeypatch.setattr(access_module, "LOOK_EVERY_S", 0.02)
+    return load_access(tmp_path, False)
+
+
+@asynccontextmanager
+async def following(access: Access) -> AsyncIterator[None]:
+    task = asyncio.create_task(access.follow())
+    try:
+        yield
+    finally:
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+
+async def until(look: Callable[[], object]) -> bool:
+    async def wait() -> None:
+        while not look():
+            await asyncio.sleep(0.005)
+
+    return await within(COUNTS_WITHIN_S, wait())
+
+
+def put(path: Path, content: bytes) -> None:
+    """As an editor does: not at once."""
+    with path.open("wb") as file:
+        file.write(content)
+
+
+async def looks(count: int) -> None:
+    """Until the files were read so often."""
+    await asyncio.sleep(count * 0.05)
+
+
+def test_a_replaced_token_counts_soon() -> None:
+    # Seen at the next look, and streams are given half a second to hear of it.
+    assert 5 * LOOK_EVERY_S <= COUNTS_WITHIN_S / 2
+
+
+async def test_a_file_that_is_replaced_counts_and_the_token_before_is_refused(
+    access: Access, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(logging.DEBUG)
-    state_dir = tmp_path / "state"
-    first = load_access(state_dir, False)
-    assert first == load_access(state_dir, False)
-    assert first.unit_token != first.operator_token
-    assert len(first.unit_token) >= 43
-    for role in Role:
-        assert token_file(state_dir, role).stat().st_mode & 0o777 == 0o600
-    assert str(token_file(state_dir, Role.UNIT)) in caplog.text
-    assert first.unit_token.decode() not in caplog.text
-    assert first.operator_token.decode() not in caplog.text
+    caplog.set_level(logging.INFO)
+    before, operator, end = access.unit_token, access.operator_token, access.end_of(Role.UNIT)
+    async with following(access):
+        path = await asyncio.to_thread(write_token, tmp_path, Role.UNIT)
+        assert await until(end.is_set)
+        after = (await asyncio.to_thread(path.read_bytes)).strip()
+        assert access.check(bearer(after), UNITS) is Role.UNIT
+        with pytest.raises(Refusal, match="unknown token"):
+            access.check(bearer(before), ANYONE)
+        # The other one stays, and so do its streams; and there is a next time.
+        assert access.check(bearer(operator), OPERATORS) is Role.OPERATOR
+        assert not access.end_of(Role.OPERATOR).is_set()
+        again = access.end_of(Role.UNIT)
+        assert not again.is_set()
+        await asyncio.to_thread(put, path, NEW)
+        assert await until(again.is_set)
+        assert access.unit_token == NEW
+    assert caplog.text.count("unit.token was replaced") == 2
+    assert after.decode() not in caplog.text
+    assert NEW.decode() not in caplog.text
 
 
-def test_a_token_file_that_others_can_read_is_closed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    load_access(tmp_path, False)
-    token_file(tmp_path, Role.UNIT).chmod(0o644)
-    load_access(tmp_path, False)
-    assert token_file(tmp_path, Role.UNIT).stat().st_mode & 0o777 == 0o600
-    assert "can be read by others" in caplog.text
+@pytest.mark.parametrize("content", [None, b"", b"short", b"x" * 1000, b"two-lines-0123456789\ntwo-lines-0123456789"])
+async def test_while_a_file_holds_no_token_the_one_before_stays_and_one_warning_says_so(
+    access: Access, tmp_path: Path, content: bytes | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    before, end = access.operator_token, access.end_of(Role.OPERATOR)
+    path = token_file(tmp_path, Role.OPERATOR)
+    async with following(access):
+        await (asyncio.to_thread(path.unlink) if content is None else asyncio.to_thread(put, path, content))
+        assert await until(lambda: "the token before stays in force" in caplog.text)
+        await looks(3)
+        assert access.check(bearer(before), OPERATORS) is Role.OPERATOR
+        assert not end.is_set()
+        assert len(caplog.records) == 1
+        assert "operator.token" in caplog.records[0].getMessage()
+        # The same token again is no other token; another one is.
+        await asyncio.to_thread(put, path, before)
+        await looks(3)
+        assert not end.is_set()
+        await asyncio.to_thread(put, path, NEW)
+        assert await until(end.is_set)
 
 
-@pytest.mark.parametrize("text", ["", "short", "x" * 1000, "ä" * 30])
-def test_a_file_without_a_token_is_refused(tmp_path: Path, text: str) -> None:
-    token_file(tmp_path, Role.UNIT).write_text(text)
-    with pytest.raises(ConfigError, match=r"unit\.token: expected a token"):
-        load_access(tmp_path, False)
-
-
-def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="file/state"):
-        load_access(tmp_path / "file" / "state", False)
+async def test_an_access_without_a_folder_stays_as_it_is() -> None:
+    await ACCESS.follow()
+    assert ACCESS.unit_token == b"unit-token-0123456789"

@@ -199,3 +199,17 @@ async def test_an_address_that_is_refused_again_and_again_does_not_fill_the_log(
     assert 0 < caplog.text.count("from 10.0.0.1 refused") <= limits_module.COMPLAINTS_BURST + 5
     await desk.call("POST", "/update", UNIT, "10.0.0.2", content=b"\xc1", headers=MSGPACK)
     assert "from 10.0.0.2 refused" in caplog.text
+
+
+def test_a_unit_whose_token_was_replaced_long_ago_is_heard_within_a_second() -> None:
+    limits = Limits()
+    limits.token_was_right("a", START_NS)
+    now_ns = START_NS
+    for _ in range(4 * (round(TRUSTED_S) + 1)):
+        now_ns += 250 * MS
+        try:
+            limits.may_show_token("a", now_ns)
+        except Refusal:
+            continue
+        limits.token_was_wrong("a", now_ns)
+    limits.may_show_token("a", now_ns + S)

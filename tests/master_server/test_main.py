@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 from pathlib import Path
 
@@ -63,3 +64,24 @@ def test_a_state_folder_that_cannot_be_made_is_named(
     (tmp_path / "file").write_text("")
     state_dir = tmp_path / "file" / "state"
     assert str(state_dir) in run(capsys, "--cell", str(cell), "--state-dir", str(state_dir))
+
+
+def test_a_new_token_is_told_by_its_file_alone(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    for role in ("unit", "operator"):
+        assert main(("new-token", role, "--state-dir", str(tmp_path))) == 0
+        path = tmp_path / f"{role}.token"
+        printed = "".join(capsys.readouterr()) + caplog.text
+        assert f"the new token of the {role} lies in {path}" in printed
+        assert path.read_text().strip() not in printed
+
+
+def test_a_new_token_without_a_folder_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert "gone/unit.token" in run(capsys, "new-token", "unit", "--state-dir", str(tmp_path / "gone"))
+    with pytest.raises(SystemExit):
+        main(("new-token", "unit"))
+    with pytest.raises(SystemExit):
+        main(("new-token", "everyone", "--state-dir", str(tmp_path)))
+    assert list(tmp_path.iterdir()) == []

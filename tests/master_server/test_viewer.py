@@ -17,6 +17,7 @@ import pytest
 
 from master_server.access import Access
 from master_server.app import add_viewer, make_app
+from master_server.tokens import Role
 from master_server.viewer.look import look
 from master_server.viewer.panel import contact_sheet, lattice_of, status_html, table_html
 from master_server.viewer.proxy import LOGIN_PAGE, Gate, is_passed, link_path
@@ -117,6 +118,15 @@ def test_a_link_grows_old() -> None:
     with pytest.raises(Refusal):
         sessions.redeem(codes[0], START_NS)
     assert sessions.redeem(codes[1], START_NS + LINK_S * S - 1) is Viewer.OPERATOR
+
+
+def test_a_link_is_void_with_the_token_under_which_it_was_made() -> None:
+    access = Access(UNIT, OPERATOR)
+    sessions = Sessions(access)
+    code = sessions.make_code(START_NS)
+    access.replace(Role.OPERATOR, b"another-token-0123456789")
+    with pytest.raises(Refusal, match="not opened yet"):
+        sessions.redeem(code, START_NS)
 
 
 def test_a_cookie_is_worth_as_much_as_the_token_behind_it() -> None:

@@ -15,13 +15,16 @@ import msgpack
 import pytest
 import uvicorn
 from websockets.asyncio.client import ClientConnection, connect
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from master_server.access import Access
-from master_server.app import make_app
+from master_server.app import Application, add_viewer, make_app
 from master_server.master import Master
+from master_server.routes.stream import TOKEN_REPLACED
 from master_server.stream import MAX_LISTENERS, Stream
-from master_server.websocket import MESSAGE_MAX_BYTES, SERVER_OPTIONS
+from master_server.tokens import Role
+from master_server.websocket import CLOSE_S, MESSAGE_MAX_BYTES, SERVER_OPTIONS
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.waiting import within
 from tests.master_server.fakes import MS, joined, master, sees_all
@@ -38,10 +41,11 @@ class Place:
     master: Master
     stream: Stream
     port: int
+    app: Application
 
-    def connect(self, query: str = "", token: str | None = UNIT, **more: Any) -> connect:
+    def connect(self, query: str = "", token: str | None = UNIT, path: str = "/stream", **more: Any) -> connect:
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-        url = f"ws://127.0.0.1:{self.port}/stream{query}"
+        url = f"ws://127.0.0.1:{self.port}{path}{query}"
         return connect(url, additional_headers=headers, proxy=None, **more)
 
 
@@ -56,7 +60,7 @@ async def serving(access: Access | None = None, **options: Any) -> AsyncIterator
         server = uvicorn.Server(config)
         task = asyncio.ensure_future(server.serve([listener]))
         try:
-            yield Place(one, app.state.stream, listener.getsockname()[1])
+            yield Place(one, app.state.stream, listener.getsockname()[1], app)
         finally:
             server.should_exit = True
             await task
@@ -211,3 +215,80 @@ async def test_a_master_that_stops_says_so_to_its_readers() -> None:
         reader = await place.connect()
         await heard(reader)
     assert await closing_code(reader) == 1012
+
+
+async def test_a_stream_ends_with_the_token_that_it_was_opened_with() -> None:
+    access = Access(UNIT.encode(), OPERATOR.encode())
+    new = "another-token-0123456789"
+    async with serving(access) as place, place.connect() as first, place.connect(token=OPERATOR) as other:
+        await heard(first)
+        began_ns = monotonic_ns()
+        access.replace(Role.UNIT, new.encode())
+        assert await closing_code(first) == TOKEN_REPLACED == 1008
+        assert first.close_reason == "the token was replaced"
+        assert monotonic_ns() - began_ns < CLOSE_S * NS_PER_S
+        assert len(place.stream) == 1
+        await heard(other)
+        await heard(other)
+        assert (await refused(place))[0] == 401
+        async with place.connect(token=new) as again:
+            await heard(again)
+
+
+async def test_a_window_of_the_viewer_ends_with_its_token_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def silent(inner: ServerConnection) -> None:
+        await inner.wait_closed()
+
+    async def opened() -> None:
+        pass
+
+    access = Access(UNIT.encode(), OPERATOR.encode())
+    async with serving(access) as place, serve(silent, "127.0.0.1", 0) as process:
+        gate = add_viewer(place.app, {})
+        monkeypatch.setattr(gate.host, "open", opened)
+        monkeypatch.setattr(gate.host, "port", next(iter(process.sockets)).getsockname()[1])
+        async with (
+            place.connect(token=UNIT, path="/viewer/") as reader,
+            place.connect(token=OPERATOR, path="/viewer/") as operator,
+        ):
+            access.replace(Role.OPERATOR, b"another-token-0123456789")
+            assert await closing_code(operator) == TOKEN_REPLACED
+            assert reader.close_code is None
+            access.replace(Role.UNIT, b"one-more-token-0123456789")
+            assert await closing_code(reader) == TOKEN_REPLACED
+
+
+async def test_a_public_stream_outlives_every_token() -> None:
+    access = Access(UNIT.encode(), OPERATOR.encode(), public_reads=True)
+    async with serving(access) as place, place.connect() as reader:
+        await heard(reader)
+        access.replace(Role.UNIT, b"another-token-0123456789")
+        for _ in range(3):
+            await heard(reader)
+
+
+async def test_who_does_not_read_is_let_go_with_its_token_too() -> None:
+    access = Access(UNIT.encode(), OPERATOR.encode())
+    async with serving(access, ws_ping_interval=None) as place, deaf(place) as raw:
+        unit = joined(place.master, 1, monotonic_ns())
+        (listener,) = place.stream.listeners
+
+        async def until_it_is_behind() -> None:
+            while place.stream.picture is None or place.stream.picture.number < listener.sent + 5:
+                unit.update(monotonic_ns(), range(4000), age_ns=MS)
+                await asyncio.sleep(0.02)
+
+        assert await within(WAIT_S, until_it_is_behind())
+        connections = [task for task in asyncio.all_tasks() if "run_asgi" in str(task.get_coro())]
+        assert len(connections) == 1
+        access.replace(Role.UNIT, b"another-token-0123456789")
+        done, _ = await asyncio.wait(connections, timeout=2.0 * CLOSE_S)
+        assert done
+        assert len(place.stream) == 0
+
+        async def until_its_end() -> None:
+            with suppress(ConnectionResetError):
+                while await asyncio.get_running_loop().sock_recv(raw, 2**16):
+                    pass
+
+        assert await within(WAIT_S, until_its_end())

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -102,7 +102,7 @@ def make_app(
 ) -> Application:
     """The application that serves one master; `limits` are shared with what holds its connections."""
     routers = [module.router for module in (units, images, cell, map, stream, robot, recording, health)]
-    app = _assembled(Application, master, access, routers, recorder, limits)
+    app = _assembled(Application, master, access, routers, recorder, limits, master.store.follow)
     app.state.loader = CellLoader()
     app.state.pictures = Pictures(master.registry)
     app.state.metrics = metrics = Metrics(master, app.state.stream, app.state.limits)
@@ -134,6 +134,7 @@ def _assembled(
     routers: list[APIRouter],
     recorder: Recorder | None,
     limits: Limits | None,
+    *beside: Callable[[], Coroutine[None, None, None]],
 ) -> Application:
     listeners = Stream(master)
 
@@ -142,13 +143,14 @@ def _assembled(
         # Now, while nobody waits for it.
         app.openapi()
         listeners.start()
-        following = asyncio.create_task(access.follow())
+        tasks = [asyncio.create_task(work()) for work in (access.follow, *beside)]
         if recorder is not None and recorder.enabled:
             await recorder.begin()
         try:
             yield
         finally:
-            following.cancel()
+            for task in tasks:
+                task.cancel()
             listeners.stop()
             if app.state.viewer is not None:
                 await app.state.viewer.host.close()

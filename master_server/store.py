@@ -10,6 +10,7 @@ called by a thread before, which leaves the document to `save_cell`.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import logging
@@ -41,6 +42,9 @@ SCHEMA_VERSION = 1
 
 LOCK_TIMEOUT_S = 3.0
 """A master that was told to stop has let go of its file by then."""
+
+TRY_EVERY_S = 1.0
+"""Between attempts to store anything at all while the last change could not be."""
 
 LOG_BYTES = 2**22
 """What SQLite's log may keep of the disk once its content is in the file."""
@@ -253,6 +257,23 @@ class Store:
             _put_cell(connection, document, meshes)
             _put(connection, "versions", versions.model_dump())
         self._named = frozenset(meshes)
+
+    # ------------------------------------------------------------------ while nothing can be stored
+
+    async def follow(self) -> None:
+        """After a change that could not be stored try whether one can again, until cancelled."""
+        while True:
+            await asyncio.sleep(TRY_EVERY_S)
+            if self.trouble is not None:
+                with contextlib.suppress(Refusal):
+                    await asyncio.to_thread(self.attempt)
+
+    def attempt(self) -> None:
+        """Write something that leaves nothing; that it can be written ends `trouble`. Raises as a change does."""
+        with self._transaction() as connection:
+            # What is as it was would not be written at all.
+            _put(connection, "attempt", 0)
+            connection.execute("DELETE FROM facts WHERE name = 'attempt'")
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:

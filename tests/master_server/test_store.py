@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import random
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from master_server import store as store_module
 from master_server.master import Master
 from master_server.store import FILE_NAME, Store, UnitRecord
 from shared.cell import Cell, PlacedMesh
@@ -22,6 +24,7 @@ from shared.errors import ConfigError, Refusal
 from shared.meshes import box_mesh
 from shared.messages import Matrix
 from shared.settings import Settings
+from shared.waiting import within
 from tests.master_server.fakes import AT_ORIGIN, MS, START_NS, FakeUnit, S, cell, joined, sees_all
 
 NOW_NS = START_NS
@@ -337,6 +340,31 @@ def test_what_cannot_be_stored_does_not_happen(store: Store) -> None:
     make_writes_work(store)
     assert other.initialize(NOW_NS).id == 2
     assert store.trouble is None
+
+
+async def test_that_changes_can_be_stored_again_is_found_without_one(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(store_module, "TRY_EVERY_S", 0.05)
+    one = await asyncio.to_thread(Master, with_box(), Settings(), store)
+    await asyncio.to_thread(make_writes_fail, store)
+    with pytest.raises(Refusal, match="nothing was changed"):
+        one.change_settings({"voxel_size_m": 0.1})
+    with pytest.raises(Refusal):
+        await asyncio.to_thread(store.attempt)
+    before = await asyncio.to_thread(store.load)
+
+    async def until_it_is_well() -> None:
+        while store.trouble is not None:
+            await asyncio.sleep(0.01)
+
+    task = asyncio.create_task(store.follow())
+    assert not await within(0.3, until_it_is_well())
+    await asyncio.to_thread(make_writes_work, store)
+    assert await within(5.0, until_it_is_well())
+    task.cancel()
+    after = await asyncio.to_thread(store.load)
+    assert (after.versions, after.settings, after.units) == (before.versions, before.settings, before.units)
 
 
 def test_a_full_disk_is_told(store: Store) -> None:

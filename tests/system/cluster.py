@@ -9,7 +9,7 @@ import ssl
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -90,11 +90,11 @@ class Cluster:
             for log in sorted(self.folder.glob("*.log")):
                 print(f"---- {log.name}\n{log.read_text()}")
 
-    def start(self, name: str, *arguments: str) -> subprocess.Popen[str]:
-        """A process of ours; its output goes to a log named after it."""
+    def start(self, name: str, *arguments: str, under: Sequence[str] = ()) -> subprocess.Popen[str]:
+        """A process of ours, as the last of the command `under`; its output goes to a log named after it."""
         with (self.folder / f"{name}.log").open("a") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", *arguments], stdout=log, stderr=subprocess.STDOUT, text=True
+                [*under, sys.executable, "-m", *arguments], stdout=log, stderr=subprocess.STDOUT, text=True
             )
         self.processes.append(process)
         return process
@@ -102,13 +102,15 @@ class Cluster:
     def log(self, name: str) -> str:
         return (self.folder / f"{name}.log").read_text()
 
-    def start_master(self, *options: str) -> subprocess.Popen[str]:
-        """A master; started again, it listens at the same port."""
+    def start_master(self, *options: str, under: Sequence[str] = ()) -> subprocess.Popen[str]:
+        """A master; started again, it listens at the same port. `under` may give it other mounts than ours."""
         ready = self.folder / "ready.json"
         process = self.start(
             "master", "master_server", "--cell", str(self.cell), "--host", "127.0.0.1", "--port", str(self.port),
             "--state-dir", str(self.folder / "master"), "--ready-file", str(ready), *options,
+            under=under,
         )  # fmt: skip
+        root = f"/proc/{process.pid}/root" if under else ""
 
         def look() -> Any:
             assert process.poll() is None, self.log("master")
@@ -116,11 +118,11 @@ class Cluster:
 
         found = until(look, "the master")
         self.port, self.url = found["port"], found["url"]
-        self.unit_token_file = found["unit_token_file"]
+        self.unit_token_file = root + found["unit_token_file"]
         self.operator.close()
         self.operator = httpx.Client(
             base_url=self.url,
-            headers={"Authorization": f"Bearer {Path(found['operator_token_file']).read_text().strip()}"},
+            headers={"Authorization": f"Bearer {Path(root + found['operator_token_file']).read_text().strip()}"},
             trust_env=False,
             verify=self.verify,
         )

@@ -1,20 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes that write to the master's store, killed in mid-write: what they acknowledged is there, and whole."""
+"""A master, and processes that write to its store, killed in mid-write: what they acknowledged is there, and whole."""
 
 from __future__ import annotations
 
+import asyncio
+import json
 import random
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import httpx
 import pytest
+import yaml
 
 from master_server.store import FILE_NAME, Store
+from shared.clock import monotonic_ns
+from shared.messages import InitializeAnswer
+from shared.waiting import within
+from shared.wire import MEDIA_TYPE, decode, encode
+from tests.master_server.fakes import AT_ORIGIN, FakeUnit, master
+from tests.system.cluster import CELL, START_S, Cluster
 
 KILLS = 100
+
+MASTER_KILLS = 10
+STEP = 0.001
+"""Between one value that is written and the next."""
+STAY = 3
+"""Units that joined last and are not deleted yet."""
 
 WRITER = """
 import sys, threading
@@ -82,3 +101,172 @@ def test_what_a_killed_process_acknowledged_is_stored_and_nothing_is_half_writte
             assert version <= stored[name] <= max(version, highest) + 1
         highest = max(stored.values())
     assert highest > KILLS
+
+
+@dataclass
+class Ledger:
+    """What one master acknowledged to writers of whom each waits for its answer; the next may have been stored, too."""
+
+    units: dict[str, int] = field(default_factory=dict)
+    poses: dict[int, int] = field(default_factory=dict)
+    settings: int = 0
+    object: int = 0
+    joins: int = 0
+    last_id: int = 0
+    unsure: set[str] = field(default_factory=set)
+    heard: set[str] = field(default_factory=set)
+    count: int = 0
+
+    def hear(self, what: str) -> None:
+        """An answer came."""
+        self.heard.add(what)
+        self.count += 1
+
+
+def at(step: int) -> list[list[float]]:
+    return [[1.0, 0.0, 0.0, step * STEP], *(list(row) for row in AT_ORIGIN[1:])]
+
+
+class Writers:
+    """All who change something at one master, at once and each from an address of its own, until it is gone."""
+
+    def __init__(self, cluster: Cluster, ledger: Ledger) -> None:
+        self._cluster = cluster
+        self._ledger = ledger
+        self._operator = {"Authorization": cluster.operator.headers["Authorization"]}
+        token = Path(cluster.unit_token_file).read_text().strip()
+        self._unit = {"Authorization": f"Bearer {token}", "Content-Type": MEDIA_TYPE, "Accept": MEDIA_TYPE}
+
+    def client(self, ip: str, headers: dict[str, str]) -> httpx.AsyncClient:
+        transport = httpx.AsyncHTTPTransport(local_address=ip)
+        return httpx.AsyncClient(base_url=self._cluster.url, headers=headers, transport=transport)
+
+    async def join(self, ip: str) -> int:
+        """A unit comes; returns its id."""
+        introduction = FakeUnit(master(), ip, f"S{ip}").introduction(monotonic_ns())
+        async with self.client(ip, self._unit) as client:
+            response = await client.post("/initialize", content=encode(introduction))
+        assert response.status_code == 200, response.text
+        return decode(InitializeAnswer, response.content).id
+
+    async def pose(self, number: int) -> None:
+        ledger = self._ledger
+        async with self.client(f"127.0.1.{number}", self._operator) as client:
+            while True:
+                step = ledger.poses[number] + 1
+                response = await client.put(f"/units/{number}/pose", json={"T_world_camera": at(step)})
+                assert response.status_code == 200, response.text
+                ledger.poses[number] = step
+                ledger.hear(f"pose {number}")
+
+    async def settings(self) -> None:
+        async with self.client("127.0.1.100", self._operator) as client:
+            while True:
+                step = self._ledger.settings + 1
+                response = await client.put("/settings", json={"stale_after_s": 1.0 + step * STEP})
+                assert response.status_code == 200, response.text
+                self._ledger.settings = step
+                self._ledger.hear("settings")
+
+    async def object(self) -> None:
+        async with self.client("127.0.1.101", self._operator) as client:
+            while True:
+                step = self._ledger.object + 1
+                response = await client.put("/cell/objects/box/pose", json={"T_world_object": at(step)})
+                assert response.status_code == 200, response.text
+                self._ledger.object = step
+                self._ledger.hear("object")
+
+    async def come_and_go(self) -> None:
+        ledger = self._ledger
+        async with self.client("127.0.1.102", self._operator) as client:
+            while True:
+                ledger.joins += 1
+                ip = f"127.0.{2 + ledger.joins // 250}.{1 + ledger.joins % 250}"
+                ledger.unsure = {ip}
+                number = await self.join(ip)
+                assert number > ledger.last_id
+                ledger.last_id = number
+                ledger.units[ip] = number
+                ledger.hear("join")
+                while len(ledger.units) > STAY:
+                    oldest = next(iter(ledger.units))
+                    ledger.unsure = {oldest}
+                    response = await client.delete(f"/units/{ledger.units[oldest]}")
+                    assert response.status_code == 204, response.text
+                    del ledger.units[oldest]
+                    ledger.hear("delete")
+                ledger.unsure = set()
+
+    async def write_until(self, kill: Callable[[], None], wait_s: float) -> None:
+        """Write; once everyone was answered, `kill` comes after `wait_s`."""
+        works = [self.pose(number) for number in self._ledger.poses]
+        works += [self.settings(), self.object(), self.come_and_go()]
+        kinds = len(works) + 1
+        self._ledger.heard.clear()
+
+        async def until_all_were_heard() -> None:
+            while len(self._ledger.heard) < kinds:
+                assert not any(task.done() for task in tasks), await asyncio.gather(*tasks, return_exceptions=True)
+                await asyncio.sleep(0.002)
+
+        tasks = [asyncio.ensure_future(_until_gone(work)) for work in works]
+        assert await within(START_S, until_all_were_heard())
+        await asyncio.sleep(wait_s)  # The moment of the kill, anywhere in a write.
+        kill()
+        await asyncio.gather(*tasks)
+
+
+async def _until_gone(work: Coroutine[Any, Any, None]) -> None:
+    try:
+        await work
+    except httpx.TransportError:
+        return
+
+
+def check(cluster: Cluster, ledger: Ledger) -> None:
+    """Whether all that was acknowledged is there; what was under way is taken over as it is."""
+    rows = {row["ip"]: row for row in cluster.get("/units")}
+    by_id = {row["id"]: row for row in rows.values()}
+    for number, step in ledger.poses.items():
+        found = round(by_id[number]["T_world_camera"][0][3] / STEP)
+        assert found in (step, step + 1)
+        assert by_id[number]["T_world_camera"] == at(found)
+        ledger.poses[number] = found
+    found = round((cluster.get("/settings")["stale_after_s"] - 1.0) / STEP)
+    assert found in (ledger.settings, ledger.settings + 1)
+    ledger.settings = found
+    (box,) = cluster.get("/cell")["objects"]
+    found = round(box["T_world_mesh"][0][3] / STEP)
+    assert found in (ledger.object, ledger.object + 1)
+    ledger.object = found
+    passers = {ip: row["id"] for ip, row in rows.items() if row["id"] not in ledger.poses}
+    for ip in passers.keys() | ledger.units.keys():
+        if ip not in ledger.unsure:
+            assert passers.get(ip) == ledger.units.get(ip), ip
+    ledger.units = dict(sorted(passers.items(), key=lambda item: item[1]))
+    ledger.last_id = max(ledger.last_id, *passers.values())
+
+
+@pytest.mark.slow
+async def test_what_a_killed_master_acknowledged_is_there_in_the_next(tmp_path: Path) -> None:
+    dice = random.Random(2)
+    box = {"name": "box", "box": [0.2, 0.2, 0.2]}
+    path = tmp_path / "cell.yaml"
+    path.write_text(yaml.safe_dump({**CELL, "objects": [box]}))
+    with Cluster(tmp_path, path) as cluster:
+        process = await asyncio.to_thread(cluster.start_master)
+        ledger = Ledger()
+        for number in (1, 2):
+            ledger.last_id = await Writers(cluster, ledger).join(f"127.0.1.{number}")
+            assert ledger.last_id == number
+            ledger.poses[number] = 0
+            cluster.put(f"/units/{number}/pose", {"T_world_camera": at(0)})
+        for _ in range(MASTER_KILLS):
+            await Writers(cluster, ledger).write_until(process.kill, dice.uniform(0.0, 0.1))
+            process.wait()
+            (tmp_path / "ready.json").unlink()
+            process = await asyncio.to_thread(cluster.start_master)
+            check(cluster, ledger)
+        assert ledger.count > 10 * MASTER_KILLS
+        print(json.dumps({"acknowledged": ledger.count, "joins": ledger.joins}))

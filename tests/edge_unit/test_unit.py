@@ -24,6 +24,7 @@ from edge_unit import uplink as uplink_module
 from edge_unit.board_layout import BoardLayout
 from edge_unit.client import MasterClient
 from edge_unit.config import PoseConfig, UnitConfig
+from edge_unit.rehearsal import rehearse
 from edge_unit.sources.frame import CameraInfo, DepthFrame
 from edge_unit.sources.image import ImageFrame, ImageInfo, ImageStream
 from edge_unit.sources.simulated import SimulatedSourceConfig
@@ -61,6 +62,12 @@ def patch(depth_mm: int, column: int = 24) -> NDArray[np.uint16]:
     depth = np.full(CAMERA.shape, FAR_MM, np.uint16)
     depth[16:32, column : column + 16] = depth_mm
     return depth
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled() -> None:
+    """In a checkout that is new, kernels are compiled here and not while a test counts seconds."""
+    rehearse()
 
 
 class FakeSource:

@@ -21,6 +21,7 @@ from schemathesis import Case, GenerationMode, checks
 from schemathesis.core.result import Ok
 from schemathesis.specs.openapi import checks as openapi_checks
 
+from master_server import pictures, registry
 from master_server.access import Access
 from master_server.app import make_app
 from master_server.limits import Limits, RateLimit
@@ -104,7 +105,11 @@ def loop() -> Iterator[asyncio.AbstractEventLoop]:
 
 @pytest.mark.parametrize("count", [CASES, pytest.param(MANY_CASES, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("label", OPERATIONS)
-def test_answers_are_as_described(label: str, count: int, loop: asyncio.AbstractEventLoop, tmp_path: Path) -> None:
+def test_answers_are_as_described(
+    label: str, count: int, loop: asyncio.AbstractEventLoop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (pictures, registry):
+        monkeypatch.setattr(module, "IMAGE_EXPIRES_S", 0.01)
     desk = fresh(tmp_path)
     registered = desk.call("POST", "/initialize", UNIT, json=example_of("POST /initialize"))
     assert loop.run_until_complete(registered).status_code == 200

@@ -321,7 +321,7 @@ def _as_on_the_wire(schemas: dict[str, Any]) -> None:
                     "minItems": count,
                     "maxItems": count,
                     "description": f"The values of {of}.",
-                    "items": {},
+                    "prefixItems": list(schemas[model.__name__]["properties"].values()),
                 }
     for name, field in (("UpdateRequest", "keys"), ("SeenReport", "bits")):
         found = schemas[name]["properties"][field]

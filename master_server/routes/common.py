@@ -269,6 +269,11 @@ async def _as_json(request: Request) -> Request:
             raise WireError("body: expected values in a few levels, got them nested too deeply") from error
         headers = [(name, value) for name, value in headers if name not in (b"content-type", b"content-length")]
         headers += [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
+    else:
+        try:
+            body.decode()
+        except UnicodeDecodeError as error:
+            raise WireError(f"body: expected JSON in UTF-8: {error.reason} at byte {error.start}") from error
 
     async def receive() -> Message:
         return {"type": "http.request", "body": body, "more_body": False}

@@ -462,3 +462,9 @@ async def test_malformed_updates_disturb_nobody(desk: Desk) -> None:
 async def test_unknown_paths_and_methods(desk: Desk) -> None:
     assert (await desk.call("GET", "/nothing")).status_code == 404
     assert (await desk.call("GET", "/update")).status_code == 405
+
+
+async def test_json_is_utf_8(desk: Desk) -> None:
+    response = await desk.call("PUT", "/settings", content=b'{"voxel_size_m": "\xff"}')
+    assert response.status_code == 422
+    assert response.json()["detail"] == "body: expected JSON in UTF-8: invalid start byte at byte 18"

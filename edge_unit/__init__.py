@@ -29,6 +29,9 @@ In the order of the flow:
     localise        the camera's pose by the board: pictures in, pose out
     board_search    looks for the board through the source's own pictures
     joints          the robot's joints at a frame's time
+    joint_delay     how much later the joints' times are than the frames'
+    recorded_delay  the same by a recording
+    delay_watch     the same while a unit runs, as a warning
     trust           which master a unit believes, by its certificate
     client          what a unit can ask the master
     cell_cache      the master's cell, kept on disk

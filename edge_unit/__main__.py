@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `run` watches until told to stop, `doctor` looks for what is wrong, and two more.
+"""The command line: `run` watches until told to stop, `doctor` looks for what is wrong, and three more.
 
-`record-images` makes a recording of images, `board` a PDF of the calibration board.
+`record-images` makes a recording of images, `joint-delay` tells how late a recording's joints are, `board` makes a PDF
+of the calibration board.
 """
 
 from __future__ import annotations
@@ -84,6 +85,19 @@ def _record_images(options: argparse.Namespace) -> int:
     return 0
 
 
+def _joint_delay(options: argparse.Namespace) -> int:
+    from edge_unit.recorded_delay import delay_of_recording
+    from shared.cell import Cell
+
+    images = load(RecordedSourceConfig, None, {}, "", {"folder": options.folder, **assignments(options.set)})
+    found = delay_of_recording(images, Cell.load(options.cell))
+    print(
+        f"joint_delay_s: {found.delay_s:.3f}  (standard deviation {1e3 * found.uncertainty_s:.1f} ms, "
+        f"{found.looks} frames with motion)"
+    )
+    return 0
+
+
 def _board(options: argparse.Namespace) -> int:
     from edge_unit.board_layout import BoardLayout, require_board
     from edge_unit.board_print import page_of, smallest_page, write_board
@@ -137,19 +151,28 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("folder", metavar="DIR", help="16-bit PNG or npz images in depth/, with camera_info.yaml")
     record.add_argument("recording", type=Path, metavar="OUT.db3")
     record.add_argument("--fps", type=float, default=15.0, help="its pace, also that of writing it (default 15)")
+    delay = commands.add_parser("joint-delay", help="how late a recording's joints are, by its frames")
+    delay.set_defaults(command=_joint_delay)
+    delay.add_argument(
+        "folder",
+        metavar="DIR",
+        help="as for record-images, with frame_times_s.csv and joint_samples.csv",
+    )
+    delay.add_argument("--cell", type=Path, required=True, metavar="CELL.YAML", help="the cell with the robot")
     board = commands.add_parser("board", help="the cell's calibration board as a PDF to be printed")
     board.set_defaults(command=_board)
     board.add_argument("--cell", type=Path, required=True, metavar="CELL.YAML", help="the cell that has the board")
     board.add_argument("--out", type=Path, required=True, metavar="BOARD.PDF")
     board.add_argument("--page", help="A4 to A0 (default: the smallest that the board fits on)")
     board.add_argument("--log-level", default="WARNING", choices=levels)
-    for each in (run, doctor, record):
+    for each in (run, doctor, record, delay):
         each.add_argument(
             "--set", action="append", default=[], metavar="NAME=VALUE", help="one value of the configuration"
         )
     run.add_argument("--log-level", default="INFO", choices=levels)
     doctor.add_argument("--log-level", default="ERROR", choices=levels)
     record.add_argument("--log-level", default="WARNING", choices=levels)
+    delay.add_argument("--log-level", default="WARNING", choices=levels)
     return parser
 
 

@@ -28,6 +28,7 @@ from edge_unit.camera_memory import CameraMemory
 from edge_unit.cell_cache import CellCache
 from edge_unit.client import MasterClient
 from edge_unit.config import SourceConfig, UnitConfig
+from edge_unit.delay_watch import DelayWatch
 from edge_unit.joints import JointEstimate
 from edge_unit.pictures import picture_raw, png_of
 from edge_unit.pipeline import EXACT, DepthPipeline
@@ -118,6 +119,7 @@ class Unit:
         self._store = BackgroundStore(config.state_dir)
         self._memory = CameraMemory(config.state_dir)
         self._stance = Stance(config.state_dir)
+        self._delay = DelayWatch()
         self._trace = None if config.trace_path is None else Trace(config.trace_path)
         self._camera: CameraInfo | None = None
         self._pipeline: DepthPipeline | None = None
@@ -298,6 +300,8 @@ class Unit:
         self._trouble = report.health.trouble
         self.uplink.offer(report)
         await self._show(commands, frame, joints)
+        if joints is not None and report.health.trouble is None:
+            await self._watch_delay(frame)
         refining = self._refining
         if refining is not None and len(refining.frames) == REFINE_FRAMES:
             self._refining = None
@@ -400,6 +404,18 @@ class Unit:
         await self.uplink.refresh_joints(at_ns)
         uncertainty_ns = clock.uncertainty_ns(frame.captured_at_ns)
         return self.uplink.joints.at(at_ns, uncertainty_ns, assignment.settings.robot_stale_after_s)
+
+    async def _watch_delay(self, frame: DepthFrame) -> None:
+        """Look whether the joints are later than the settings say; the frame was offered and need not wait."""
+        pipeline, clock = self._pipeline, self.uplink.clock
+        if frame.joints is not None or pipeline is None or not clock.known:
+            return
+        at_ns = frame.captured_at_ns + clock.offset_ns
+        joints = self._delay.joints(self.uplink.joints)
+        if joints is not None:
+            await asyncio.to_thread(self._delay.look, joints)
+        if self._delay.due(at_ns):
+            await asyncio.to_thread(self._delay.keep, pipeline, frame.depth, at_ns)
 
     def _take_commands(self) -> list[Command]:
         commands = []
@@ -566,7 +582,7 @@ class Unit:
                 frame=frame.frame_number,
                 moved=stance.moved or None,
                 blind=stance.blind or None,
-                warning=stance.warning or crowd,
+                warning=stance.warning or self._delay.warning(assignment.settings.joint_delay_s) or crowd,
             ),
         )
 

@@ -53,10 +53,9 @@ class BoardPicture:
         self._px_per_m = min(TEXTURE_PX_PER_M, TEXTURE_MAX_PX / max(width_m, height_m))
         self._texture = self._drawn(layout)
 
-    def expose(self, T_camera_board: Transform, hidden: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-        """The picture (H, W) float32 without noise; the board is not seen where `hidden` (H, W), nor from behind."""
-        camera, quality = self._intrinsics, self._quality
-        image = np.full(camera.shape, quality.surroundings, dtype=np.float32)
+    def part(self, T_camera_board: Transform) -> tuple[slice, slice] | None:
+        """Rows and columns in which the board is seen; None where it is not, or from behind."""
+        camera = self._intrinsics
         (width_m, height_m), margin_m = self._size_m, self._margin_m
         outline_m = np.array(((0, 0, 0), (width_m, 0, 0), (width_m, height_m, 0), (0, height_m, 0))) - (
             margin_m,
@@ -66,17 +65,25 @@ class BoardPicture:
         corners = apply(T_camera_board, outline_m)
         eye_m = inverse(T_camera_board)[:3, 3]
         if corners[:, 2].min() < 0.05 or eye_m[2] >= 0.0:
-            return image
+            return None
         pixels = camera.project(corners)
-        first = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - 4, 0)
-        last = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 5, (camera.width, camera.height))
-        if (last <= first).any():
+        left, top = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - 4, 0).tolist()
+        right, bottom = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 5, (camera.width, camera.height)).tolist()
+        return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
+
+    def expose(self, T_camera_board: Transform, hidden: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+        """The picture (H, W) float32 without noise; the board is not seen where `hidden` (H, W), nor from behind."""
+        camera, quality, margin_m = self._intrinsics, self._quality, self._margin_m
+        image = np.full(camera.shape, quality.surroundings, dtype=np.float32)
+        seen_in = self.part(T_camera_board)
+        if seen_in is None:
             return image
-        width, height = last - first
-        s = float(SUPERSAMPLING)
+        part = image[seen_in]
+        height, width = part.shape
+        s, top, left = float(SUPERSAMPLING), seen_in[0].start, seen_in[1].start
         # A pixel's centre is at integer coordinates, on either grid.
         fine_of_pixel = np.array(
-            ((s, 0.0, 0.5 * (s - 1.0) - s * first[0]), (0.0, s, 0.5 * (s - 1.0) - s * first[1]), (0.0, 0.0, 1.0))
+            ((s, 0.0, 0.5 * (s - 1.0) - s * left), (0.0, s, 0.5 * (s - 1.0) - s * top), (0.0, 0.0, 1.0))
         )
         pixel_of_camera = np.array(((camera.fx, 0.0, camera.cx), (0.0, camera.fy, camera.cy), (0.0, 0.0, 1.0)))
         step_m = 1.0 / self._px_per_m
@@ -88,14 +95,12 @@ class BoardPicture:
         fine = cv2.warpPerspective(
             self._texture,
             homography,
-            (int(width) * SUPERSAMPLING, int(height) * SUPERSAMPLING),
+            (width * SUPERSAMPLING, height * SUPERSAMPLING),
             flags=cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=quality.surroundings,
         )
-        seen = cv2.resize(fine, (int(width), int(height)), interpolation=cv2.INTER_AREA)
-        part = image[first[1] : last[1], first[0] : last[0]]
-        np.copyto(part, seen)
+        np.copyto(part, cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA))
         if hidden is not None:
             image[hidden] = quality.surroundings
         if quality.blur_px > 0.0:
@@ -141,20 +146,35 @@ class BoardCamera:
         self._world = world
         self._rng = np.random.default_rng((seed, 0xB0A4))
         T_world_image = T_world_depth @ T_depth_image
-        self._renderer = RasterRenderer(self.intrinsics, T_world_image)
         board = world.cell.board
         self._picture = None if board is None else BoardPicture(BoardLayout.of(board), self.intrinsics)
         self._T_image_board = None if board is None else inverse(T_world_image) @ board.T_world_board
+        # What stands elsewhere in the picture is not drawn.
+        self._part: tuple[slice, slice] | None = None
+        if self._picture is not None and self._T_image_board is not None:
+            self._part = self._picture.part(self._T_image_board)
+        if self._part is not None and self._T_image_board is not None:
+            part = _cut_out(self.intrinsics, self._part)
+            self._renderer = RasterRenderer(part, T_world_image)
+            self._hiding_z_m = _plane_z_m(part, self._T_image_board) - THICKNESS_M
 
     def take(self, t_s: float) -> NDArray[np.uint8]:
         """The picture (720, 1280) uint8 taken at `t_s`, RGB for colour; what stands before the board hides it."""
         picture, T_image_board = self._picture, self._T_image_board
         if picture is None or T_image_board is None:
             return np.full(self.intrinsics.shape, round(PictureQuality().surroundings), np.uint8)
-        view = self._renderer.render(self._world.scene(t_s))
-        hidden = view.z_m < _plane_z_m(self.intrinsics, T_image_board) - THICKNESS_M
+        hidden = np.zeros(self.intrinsics.shape, np.bool_)
+        if self._part is not None:
+            hidden[self._part] = self._renderer.render(self._world.scene(t_s)).z_m < self._hiding_z_m
         grey = picture.develop(picture.expose(T_image_board, hidden), self._rng)
         return grey if self.stream == "infrared" else np.repeat(grey[:, :, None], 3, axis=2)
+
+
+def _cut_out(camera: Intrinsics, part: tuple[slice, slice]) -> Intrinsics:
+    """The camera of a part of the picture."""
+    rows, columns = part
+    height, width = rows.stop - rows.start, columns.stop - columns.start
+    return Intrinsics(width, height, camera.fx, camera.fy, camera.cx - columns.start, camera.cy - rows.start)
 
 
 def _plane_z_m(camera: Intrinsics, T_image_board: Transform) -> NDArray[np.float64]:

@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps right-time source-faults faults bench-pipeline bench-board bench-master bench-stance pictures test lint clean libusb
+.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench-pipeline bench-board bench-master bench-stance pictures test lint clean libusb
 
 ARGS ?=
 EXTRAS := edge,master,realsense,sim,dev
@@ -40,6 +40,9 @@ source-faults: $(READY) libusb ## a RealSense camera that hangs, dies and is unp
 
 faults: $(READY) ## units, master, networks, clocks and disks that fail: what the map says meanwhile
 	@$(BIN)/python -m benchmarks.faults $(ARGS)
+
+plug-and-play: $(READY) ## four units that know nothing but a token, and what people do to them later
+	@$(BIN)/python -m benchmarks.plug_and_play $(ARGS)
 
 bench-pipeline: $(BENCH_READY) libusb ## what a frame costs, beside Open3D, OctoMap and Embree on the same frames
 	@$(BIN)/python -m benchmarks.pipeline $(ARGS)

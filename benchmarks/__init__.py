@@ -24,6 +24,10 @@ In the order of the flow:
     fault_watch  asks for the map all the time, and holds the answers against the truth
     fault_site   a master, two units and a robot, and all that may be done to them
     faults       what the map says while processes, clocks, networks and disks fail
+    plug_network  a switch with sockets for units, each with a network of its own
+    plug_site     a master, a robot and units that are given nothing but a token
+    plug_judge    where their cameras really hang, and what of their voxels is robot
+    plug_and_play units are plugged in, moved, exchanged, knocked and covered
     ur3_scene    a UR3 in a room, something unknown beside it: what the speed is measured on
     peers        the same work by Open3D, OctoMap and Embree
     pipeline     what a frame costs, in turns with them

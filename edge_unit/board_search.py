@@ -16,6 +16,10 @@ from shared.errors import BoardError, SourceError
 FRAMES = 20
 """Of which most show the board: a mean of these is as good as one of more, for what they share does not average out."""
 
+GOOD_FRAMES = 8
+GOOD_MM, GOOD_DEG = 5.0, 0.1
+"""So many that agree on a pose known this well are enough: no margin of the filter is that narrow."""
+
 EMPTY_FRAMES = 15
 """With no marker at all in so many pictures there is no board; one may be hidden by somebody who passes."""
 
@@ -79,6 +83,8 @@ class BoardSearch:
                         late = monotonic_ns() - begun_ns > MAX_LOOK_S * NS_PER_S
                         if late or empty >= EMPTY_FRAMES or localiser.frames_with_pose >= FRAMES:
                             break
+                        if await asyncio.to_thread(_is_good, localiser):
+                            break
                 if not seen:
                     raise SourceError("the camera delivered no picture to look for the board in")
                 found = await asyncio.to_thread(localiser.result)
@@ -90,3 +96,14 @@ class BoardSearch:
         self.outcome = ""
         self.begin_anew()
         return found
+
+
+def _is_good(localiser: BoardLocaliser) -> bool:
+    """Whether the pose is known so well that more pictures are not worth the time."""
+    if localiser.frames_with_pose < GOOD_FRAMES:
+        return False
+    try:
+        found = localiser.result()
+    except BoardError:
+        return False
+    return found.uncertainty_mm <= GOOD_MM and found.uncertainty_deg <= GOOD_DEG

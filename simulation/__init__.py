@@ -14,6 +14,7 @@ and tests need no clock. In the order of the flow:
     truth        which voxels should be reported, and which must not
     board_picture what a camera's picture shows of the calibration board
     camera       a depth camera in the world, and where a cell's cameras hang
+    handling     what people do to a camera: they knock it, cover it, plug in another
     controller   the robot's controller: reports its joints to the master
     warm_up      compiles what a simulated unit needs, once for many
     evaluation   what units reported, held against what was there

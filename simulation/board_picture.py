@@ -20,6 +20,9 @@ TEXTURE_PX_PER_M = 8000.0
 TEXTURE_MAX_PX = 6000
 """A board is drawn once at 0.125 mm a pixel, with exact grey at its edges, or coarser if it is large."""
 
+TEXTURE_PX_A_RAY = 1.5
+"""At the least, so that what lies between two rays is not lost."""
+
 SUPERSAMPLING = 4
 """Rays along each side of a pixel."""
 
@@ -44,13 +47,20 @@ class PictureQuality:
 class BoardPicture:
     """Draws one board as one camera sees it."""
 
-    def __init__(self, layout: BoardLayout, intrinsics: Intrinsics, quality: PictureQuality | None = None) -> None:
+    def __init__(
+        self,
+        layout: BoardLayout,
+        intrinsics: Intrinsics,
+        quality: PictureQuality | None = None,
+        px_per_m: float = TEXTURE_PX_PER_M,
+    ) -> None:
+        """The board itself is drawn at `px_per_m` at most, which a board that is far away may have less of."""
         self._intrinsics = intrinsics
         self._quality = quality or PictureQuality()
         self._margin_m = MARGIN_SQUARES * layout.board.square_m
         width_m, height_m = (side + 2.0 * self._margin_m for side in layout.size_m)
         self._size_m = width_m, height_m
-        self._px_per_m = min(TEXTURE_PX_PER_M, TEXTURE_MAX_PX / max(width_m, height_m))
+        self._px_per_m = min(px_per_m, TEXTURE_PX_PER_M, TEXTURE_MAX_PX / max(width_m, height_m))
         self._texture = self._drawn(layout)
 
     def part(self, T_camera_board: Transform) -> tuple[slice, slice] | None:
@@ -147,8 +157,14 @@ class BoardCamera:
         self._rng = np.random.default_rng((seed, 0xB0A4))
         T_world_image = T_world_depth @ T_depth_image
         board = world.cell.board
-        self._picture = None if board is None else BoardPicture(BoardLayout.of(board), self.intrinsics)
-        self._T_image_board = None if board is None else inverse(T_world_image) @ board.T_world_board
+        self._picture: BoardPicture | None = None
+        self._T_image_board: Transform | None = None
+        if board is not None:
+            self._T_image_board = inverse(T_world_image) @ board.T_world_board
+            layout = BoardLayout.of(board)
+            nearest_m = float(np.linalg.norm(self._T_image_board[:3, 3])) - float(np.hypot(*layout.size_m))
+            px_per_m = TEXTURE_PX_A_RAY * SUPERSAMPLING * focal_px / max(nearest_m, 0.1)
+            self._picture = BoardPicture(layout, self.intrinsics, px_per_m=px_per_m)
         # What stands elsewhere in the picture is not drawn.
         self._part: tuple[slice, slice] | None = None
         if self._picture is not None and self._T_image_board is not None:

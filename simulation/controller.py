@@ -18,7 +18,7 @@ from pathlib import Path
 from types import FrameType
 from urllib.parse import urlsplit
 
-from shared.clock import NS_PER_S, monotonic_ns
+from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from simulation.robot_path import RobotPath
 
 RATE_HZ = 125.0
@@ -34,27 +34,29 @@ RETRY_S = 0.2
 class Controller:
     """Drives a simulated robot along its path and reports its joints to a master on the same machine."""
 
-    def __init__(self, url: str, token: str, path: RobotPath, epoch_ns: int) -> None:
-        """`epoch_ns` is the CLOCK_MONOTONIC at which the path's time is 0."""
+    def __init__(self, url: str, token: str, path: RobotPath, epoch_ns: int, late_ns: int = 0) -> None:
+        """`epoch_ns` is the CLOCK_MONOTONIC at which the path's time is 0; what is reported is of `late_ns` ago."""
         parts = urlsplit(url)
         self._connection = http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=TIMEOUT_S)
         self._headers = {"Authorization": f"Bearer {token}", "Content-Type": "application/json"}
         self._path = path
         self._epoch_ns = epoch_ns
+        self._late_ns = late_ns
 
     def report(self, now_ns: int) -> None:
-        """Tell where the robot is at `now_ns`.
+        """Tell where the robot is at `now_ns`, or where it was `late_ns` before.
 
         Raises:
             OSError: the master cannot be reached.
             http.client.HTTPException: it said no, or what came was no answer.
         """
-        t_s = (now_ns - self._epoch_ns) / NS_PER_S
+        at_ns = now_ns - self._late_ns
+        t_s = (at_ns - self._epoch_ns) / NS_PER_S
         body = {
             "positions": self._path.joints_at(t_s).tolist(),
             "velocities": self._path.velocities_at(t_s).tolist(),
             # On one machine the master's clock is ours.
-            "at_ns": now_ns,
+            "at_ns": at_ns,
         }
         self._connection.request("PUT", "/robot/joints", json.dumps(body), self._headers)
         answer = self._connection.getresponse()
@@ -92,7 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
     token = options.token_file.read_text(encoding="ascii").strip()
-    with closing(Controller(options.url, token, RobotPath.demo(options.speed), options.epoch_ns)) as controller:
+    path, late_ns = RobotPath.demo(options.speed), round(options.late_ms * NS_PER_MS)
+    with closing(Controller(options.url, token, path, options.epoch_ns, late_ns)) as controller:
         controller.run(options.rate, stopped)
     return 0
 
@@ -106,6 +109,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--rate", type=float, default=RATE_HZ, help=f"reports a second (default: {RATE_HZ:g})")
     parser.add_argument("--speed", type=float, default=1.0, help="factor on the robot's speed (default: 1)")
+    parser.add_argument(
+        "--late-ms", type=float, default=0.0, help="what is reported is so old, and its time says so (default: 0)"
+    )
     return parser
 
 

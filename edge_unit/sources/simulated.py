@@ -12,23 +12,30 @@ import itertools
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Literal
 
 import msgpack
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from edge_unit.sources.frame import CameraInfo, DepthFrame
 from edge_unit.sources.image import ImageFrame, ImageInfo, ImageStream
+from shared.camera import Intrinsics
 from shared.cell import Cell
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, SourceError
+from shared.transforms import Transform, from_xyz_rpy, identity
 from shared.waiting import within
 
 if TYPE_CHECKING:
     from simulation.board_picture import BoardCamera
     from simulation.camera import SimulatedCamera, SimulatedFrame
+    from simulation.handling import Handling, Hands
     from simulation.truth import TruthFinder
+    from simulation.world import World
 
 
 class SimulatedSourceConfig(BaseModel):
@@ -49,6 +56,9 @@ class SimulatedSourceConfig(BaseModel):
     seed: int = Field(default=0, ge=0, le=0xFFFF, description="Decides who walks how, and all noise.")
     knows_pose: bool = Field(default=True, description="Else it must be told its pose, or find it by the board.")
     cell: Path | None = Field(default=None, description="A cell.yaml with a UR3e; the demo cell when left out.")
+    handling: Path | None = Field(
+        default=None, description="JSON file of what is done to the camera now: knocked, covered, exchanged."
+    )
     truth_path: Path | None = Field(
         default=None, description="File to which the truth of every frame is appended, for evaluation."
     )
@@ -63,8 +73,9 @@ class SimulatedSourceConfig(BaseModel):
 class SimulatedLook:
     """Pictures of the board as the simulated camera takes them; an `ImageLook`."""
 
-    def __init__(self, camera: BoardCamera, worker: ThreadPoolExecutor, epoch_ns: int) -> None:
+    def __init__(self, camera: BoardCamera, hands: Hands, worker: ThreadPoolExecutor, epoch_ns: int) -> None:
         self._camera = camera
+        self._hands = hands
         self._worker = worker
         self._epoch_ns = epoch_ns
 
@@ -81,7 +92,11 @@ class SimulatedLook:
         for number in itertools.count():
             now_ns = monotonic_ns()
             t_s = (now_ns - self._epoch_ns) / NS_PER_S
-            yield ImageFrame(await loop.run_in_executor(self._worker, self._camera.take, t_s), now_ns, number)
+            yield ImageFrame(await loop.run_in_executor(self._worker, self._take, t_s), now_ns, number)
+
+    def _take(self, t_s: float) -> NDArray[np.uint8]:
+        image = self._camera.take(t_s)
+        return np.zeros_like(image) if self._hands.now().covered else image
 
 
 class SimulatedSource:
@@ -97,6 +112,9 @@ class SimulatedSource:
         # Nobody triggers the cameras of a cell together; here they take turns.
         self._first_ns = config.epoch_ns + self._period_ns * config.camera // config.cameras
         self._camera: SimulatedCamera | None = None
+        self._hands: Hands | None = None
+        self._handled: Handling | None = None
+        self._T_world_place = identity()
         self._truth: TruthFinder | None = None
         self._truth_file: BinaryIO | None = None
         self._worker: ThreadPoolExecutor | None = None
@@ -140,7 +158,8 @@ class SimulatedSource:
         if worker is None:
             raise SourceError("simulated camera: a look was asked for before it was opened")
         eye = await asyncio.get_running_loop().run_in_executor(worker, self._board_camera, stream)
-        yield SimulatedLook(eye, worker, self._config.epoch_ns)
+        assert self._hands is not None
+        yield SimulatedLook(eye, self._hands, worker, self._config.epoch_ns)
 
     async def close(self) -> None:
         """See `DepthSource`."""
@@ -159,8 +178,8 @@ class SimulatedSource:
         """Build the world; imports the simulation, which a unit without it does not have."""
         config = self._config
         try:
-            from simulation.camera import SimulatedCamera, d435i_intrinsics, rig
-            from simulation.truth import TruthFinder
+            from simulation.camera import d435i_intrinsics, rig
+            from simulation.handling import Hands
             from simulation.world import World
         except ImportError as error:
             raise SourceError(
@@ -172,21 +191,34 @@ class SimulatedSource:
             intrinsics = d435i_intrinsics(config.width, config.height)
             world = World.demo(config.people, config.seed, Cell.load(config.cell) if config.cell else None)
             pose = rig(world.cell, config.cameras)[config.camera]
-            lattice = world.cell.lattice(config.truth_voxel_size_m)
+            world.cell.lattice(config.truth_voxel_size_m)
         except CellwatchError as error:
             raise SourceError(f"simulated camera: {error}") from error
-        camera = SimulatedCamera(world, pose, intrinsics, seed=config.seed * 64 + config.camera)
-        # The first frame compiles what is not in the cache yet.
-        first = camera.capture(0.0)
+        self._hands = Hands(config.handling)
+        handled = self._hands.now()
+        self._hang(world, pose, intrinsics, handled)
         if config.truth_path is not None:
-            self._truth = TruthFinder(intrinsics, pose, lattice, camera.noise)
-            self._truth.find(first.view)
             try:
                 self._truth_file = config.truth_path.open("ab")
             except OSError as error:
                 raise SourceError(f"simulated camera: truth_path: {error}") from error
-        self._camera = camera
-        return CameraInfo(config.serial, "Simulated D435i", intrinsics, pose if config.knows_pose else None)
+        serial = handled.serial or config.serial
+        return CameraInfo(serial, "Simulated D435i", intrinsics, pose if config.knows_pose else None)
+
+    def _hang(self, world: World, T_world_place: Transform, intrinsics: Intrinsics, handled: Handling) -> None:
+        """Hang the camera where hands put it. The first frame compiles what is not in the cache yet."""
+        from simulation.camera import SimulatedCamera
+        from simulation.truth import TruthFinder
+
+        config = self._config
+        pose = T_world_place @ from_xyz_rpy(handled.xyz, np.radians(handled.rpy_deg))
+        camera = SimulatedCamera(world, pose, intrinsics, seed=config.seed * 64 + config.camera)
+        first = camera.capture(0.0)
+        if config.truth_path is not None:
+            lattice = world.cell.lattice(config.truth_voxel_size_m)
+            self._truth = TruthFinder(intrinsics, pose, lattice, camera.noise)
+            self._truth.find(first.view)
+        self._camera, self._handled, self._T_world_place = camera, handled, T_world_place
 
     def _board_camera(self, stream: ImageStream) -> BoardCamera:
         from simulation.board_picture import BoardCamera
@@ -201,11 +233,19 @@ class SimulatedSource:
     def _stop(self) -> None:
         if self._truth_file is not None:
             self._truth_file.close()
-        self._camera, self._truth, self._truth_file = None, None, None
+        self._camera, self._hands, self._truth, self._truth_file = None, None, None, None
 
     def _capture(self, due_ns: int) -> SimulatedFrame:
         assert self._camera is not None
-        return self._camera.capture((due_ns - self._config.epoch_ns) / NS_PER_S)
+        assert self._hands is not None
+        assert self._handled is not None
+        handled, before = self._hands.now(), self._handled
+        if handled.serial != before.serial:
+            raise SourceError(f"simulated camera: {before.serial or self._config.serial} was unplugged")
+        if (handled.xyz, handled.rpy_deg) != (before.xyz, before.rpy_deg):
+            self._hang(self._camera.world, self._T_world_place, self._camera.intrinsics, handled)
+        frame = self._camera.capture((due_ns - self._config.epoch_ns) / NS_PER_S)
+        return replace(frame, depth=np.zeros_like(frame.depth)) if handled.covered else frame
 
     def _write_truth(self, captured_at_ns: int, frame_number: int, frame: SimulatedFrame) -> None:
         assert self._truth is not None

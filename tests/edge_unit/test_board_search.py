@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_unit.board_layout import BoardLayout
-from edge_unit.board_search import EMPTY_FRAMES, FRAMES, RETRY_MIN_S, BoardSearch
+from edge_unit.board_search import EMPTY_FRAMES, FRAMES, GOOD_FRAMES, RETRY_MIN_S, BoardSearch
 from edge_unit.sources.image import ImageFrame, ImageInfo, ImageStream
 from edge_unit.sources.simulated import SimulatedSource, SimulatedSourceConfig
 from shared.camera import Intrinsics
@@ -67,10 +67,16 @@ async def test_it_looks_until_it_has_enough() -> None:
     search = BoardSearch(source, "infrared")
     found = await search.look(BOARD, told.append)
     assert np.abs(found.T_world_camera - inverse(T_CAMERA_BOARD)).max() < 2e-3
-    assert found.frames_used == FRAMES
+    assert found.frames_used == GOOD_FRAMES
     assert told[:2] == ["looking for the board: 12 of 12 markers", "looking for the board: 0 of 12 markers"]
     assert not source.looking
     assert search.outcome == ""
+
+
+async def test_a_pose_that_is_not_known_well_takes_more_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("edge_unit.board_search.GOOD_MM", 0.0)
+    found = await BoardSearch(Pictures(board_picture()), "infrared").look(BOARD, lambda seen: None)
+    assert found.frames_used == FRAMES
 
 
 async def test_without_a_board_it_looks_ever_less_often() -> None:

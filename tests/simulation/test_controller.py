@@ -58,6 +58,16 @@ def test_it_tells_where_the_robot_is_at_the_time_it_names(master: tuple[str, Rec
     np.testing.assert_allclose(body["velocities"], path.velocities_at(1.25))
 
 
+def test_what_comes_late_has_its_own_time(master: tuple[str, Received, list[int]]) -> None:
+    url, received, _ = master
+    path = RobotPath.demo()
+    with closing(Controller(url, "secret", path, 0, late_ns=40_000_000)) as controller:
+        controller.report(1_000_000_000)
+    ((_, _, body),) = received
+    assert body["at_ns"] == 960_000_000
+    np.testing.assert_allclose(body["positions"], path.joints_at(0.96))
+
+
 def test_a_refusal_is_an_error(master: tuple[str, Received, list[int]]) -> None:
     url, _, status = master
     status[0] = 409

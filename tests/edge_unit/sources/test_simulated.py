@@ -19,7 +19,9 @@ from edge_unit.sources.simulated import SimulatedSource, SimulatedSourceConfig
 from shared.cell import Cell
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import SourceError
+from shared.transforms import from_xyz_rpy
 from simulation.camera import SimulatedCamera, d435i_intrinsics, rig
+from simulation.handling import LEFT_ALONE, Handling
 from simulation.truth import TruthFinder
 from simulation.world import DEMO_CELL, World
 
@@ -156,3 +158,46 @@ async def test_without_the_simulation_it_says_what_to_install(monkeypatch: pytes
 def test_a_wrong_configuration_is_refused(bad: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         SimulatedSourceConfig.model_validate(bad)
+
+
+async def test_a_camera_that_is_knocked_covered_and_exchanged(cell: Cell, tmp_path: Path) -> None:
+    handling = tmp_path / "handling.json"
+    config = SimulatedSourceConfig(camera=1, fps=30.0, people=0, handling=handling)
+    source = SimulatedSource(config)
+    knock = Handling(xyz=(0.02, 0.0, 0.01), rpy_deg=(1.0, 0.0, -2.0))
+    try:
+        info = await asyncio.wait_for(source.open(), WAIT_S)
+        assert info.T_world_camera is not None
+        before = (await asyncio.wait_for(take(source, 1), WAIT_S))[0]
+        knock.write(handling)
+        knocked = (await asyncio.wait_for(take(source, 1), WAIT_S))[0]
+        Handling(covered=True).write(handling)
+        covered = (await asyncio.wait_for(take(source, 1), WAIT_S))[0]
+        async with source.look("infrared") as look, aclosing(look.images()) as images:
+            assert not (await anext(images)).pixels.any()
+        LEFT_ALONE.write(handling)
+        back = (await asyncio.wait_for(take(source, 1), WAIT_S))[0]
+        Handling(serial="ANOTHER").write(handling)
+        with pytest.raises(SourceError, match="SIM0000001 was unplugged"):
+            await asyncio.wait_for(take(source, 1), WAIT_S)
+        await source.close()
+        assert (await asyncio.wait_for(source.open(), WAIT_S)).serial == "ANOTHER"
+    finally:
+        await source.close()
+    assert not covered.depth.any()
+    world, place = World.demo(people=0, cell=cell), rig(cell, 4)[1]
+    for frame, hangs in (
+        (before, np.eye(4)),
+        (knocked, from_xyz_rpy(knock.xyz, np.radians(knock.rpy_deg))),
+        (back, np.eye(4)),
+    ):
+        camera = SimulatedCamera(world, place @ hangs, info.intrinsics, seed=1)
+        np.testing.assert_array_equal(frame.depth, camera.capture(frame.captured_at_ns / NS_PER_S).depth)
+
+
+async def test_hands_that_nobody_understands(tmp_path: Path) -> None:
+    handling = tmp_path / "handling.json"
+    handling.write_text('{"covered": "perhaps"}')
+    source = SimulatedSource(SimulatedSourceConfig(handling=handling))
+    with pytest.raises(SourceError, match="covered"):
+        await asyncio.wait_for(source.open(), WAIT_S)

@@ -213,8 +213,8 @@ class Master:
             InputError: the pose is no rigid transform.
         """
         slot = self.registry.get(unit_id) if ip is None else self.registry.own(unit_id, ip)
-        self.registry.set_pose(slot, matrix_of(validated(T_world_camera, "T_world_camera")), origin)
-        slot.pose_quality = quality or PoseQuality()
+        pose = matrix_of(validated(T_world_camera, "T_world_camera"))
+        self.registry.set_pose(slot, pose, origin, quality)
         self._withdraw(slot.id)
         self._changed()
         logger.info("unit %d (%s): its pose is set (%s)", slot.id, slot.ip, origin, extra=slot.log_fields("pose"))

@@ -96,7 +96,6 @@ class Slot:
     versions: Versions = field(default_factory=Versions)
     keys: NDArray[np.uint32] = field(default_factory=lambda: NO_KEYS)
     health: Health = field(default_factory=Health)
-    pose_quality: PoseQuality = field(default_factory=PoseQuality)
     told_pose: Matrix | None = None
     warning: str = ""
     asked: deque[_Asked] = field(default_factory=deque)
@@ -117,7 +116,6 @@ class Slot:
         """What is kept of it is this from now on; with another pose, what it reported is void."""
         if record.pose_version != self.record.pose_version:
             self.keys = NO_KEYS
-            self.pose_quality = PoseQuality()
         self.record = record
         # Each update asks for these.
         self.id, self.ip = record.id, record.ip
@@ -271,7 +269,7 @@ class Slot:
             health=self.health,
             T_world_camera=self.T_world_camera,
             pose_origin=self.record.pose_origin,
-            pose_quality=self.pose_quality,
+            pose_quality=self.record.pose_quality,
             versions=self.versions,
             last_command=self.last_command,
         )
@@ -382,13 +380,15 @@ class Registry:
             logger.warning("unit %d (%s): %s", slot.id, ip, slot.warning, extra=slot.log_fields("pose"))
         return slot, elsewhere
 
-    def set_pose(self, slot: Slot, T_world_camera: Matrix, origin: PoseOrigin) -> None:
+    def set_pose(
+        self, slot: Slot, T_world_camera: Matrix, origin: PoseOrigin, quality: PoseQuality | None = None
+    ) -> None:
         """The camera is elsewhere from now on.
 
         Raises:
             Refusal: 507, it cannot be stored; nothing was changed.
         """
-        record = slot.record.posed(T_world_camera, origin)
+        record = slot.record.posed(T_world_camera, origin, quality=quality)
         self._store.save_units([record])
         slot.become(record)
 
@@ -459,7 +459,7 @@ def _registered(request: InitializeRequest, ip: str, before: UnitRecord | int, e
         record = UnitRecord(id=before, ip=ip)
         for old in elsewhere:
             if old.T_world_camera is not None and old.record.boot_id and old.record.boot_id == request.boot_id:
-                record = record.posed(old.T_world_camera, old.record.pose_origin)
+                record = record.posed(old.T_world_camera, old.record.pose_origin, quality=old.record.pose_quality)
     elif before.serial != request.serial:
         note = f"the camera changed from {before.serial} to {request.serial}, so its pose is void"
         record = before.posed(None, None, note)

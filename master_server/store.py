@@ -28,7 +28,7 @@ from shared.cell import Cell
 from shared.configuration import sentence
 from shared.errors import CellError, ConfigError, Refusal
 from shared.files import sync_folder
-from shared.messages import Counter, Matrix, Message, PoseOrigin, Versions
+from shared.messages import Counter, Matrix, Message, PoseOrigin, PoseQuality, Versions
 from shared.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -38,7 +38,10 @@ FILE_NAME = "master.db"
 APPLICATION_ID = 0x43574D53
 """In the file's header, so that a database of something else is never taken for ours."""
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+
+UPGRADES = {1: "ALTER TABLE units ADD COLUMN pose_quality TEXT NOT NULL DEFAULT '{}'"}
+"""By version: what makes a store of it one of the next version."""
 
 LOCK_TIMEOUT_S = 3.0
 """A master that was told to stop has let go of its file by then."""
@@ -60,7 +63,8 @@ CREATE TABLE units (
     T_world_camera TEXT,
     pose_origin TEXT,
     pose_version INTEGER NOT NULL,
-    note TEXT NOT NULL
+    note TEXT NOT NULL,
+    pose_quality TEXT NOT NULL
 );
 CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE meshes (sha256 TEXT PRIMARY KEY, data BLOB NOT NULL);
@@ -82,8 +86,15 @@ class UnitRecord(Message):
     pose_origin: PoseOrigin | None = None
     pose_version: Counter = 0
     note: str = ""
+    pose_quality: PoseQuality = PoseQuality()
 
-    def posed(self, T_world_camera: Matrix | None, origin: PoseOrigin | None, note: str = "") -> UnitRecord:
+    def posed(
+        self,
+        T_world_camera: Matrix | None,
+        origin: PoseOrigin | None,
+        note: str = "",
+        quality: PoseQuality | None = None,
+    ) -> UnitRecord:
         """The same unit with its camera elsewhere, or where nobody knows; `note` tells why."""
         return self.model_copy(
             update={
@@ -91,6 +102,7 @@ class UnitRecord(Message):
                 "pose_origin": origin,
                 "pose_version": self.pose_version + 1,
                 "note": note,
+                "pose_quality": quality or PoseQuality(),
             }
         )
 
@@ -227,6 +239,7 @@ class Store:
             for unit in changed:
                 fields = dict(unit)
                 fields["T_world_camera"] = None if unit.T_world_camera is None else json.dumps(unit.T_world_camera)
+                fields["pose_quality"] = unit.pose_quality.model_dump_json(exclude_none=True)
                 connection.execute(statement, tuple(fields.values()))
                 connection.execute(
                     "INSERT INTO facts VALUES ('last_id', ?) ON CONFLICT (name) DO UPDATE SET value = excluded.value "
@@ -345,7 +358,11 @@ def _check(connection: sqlite3.Connection, path: Path) -> None:
     connection.execute(f"PRAGMA journal_size_limit = {LOG_BYTES}")
     # Takes the lock, which a read alone would not keep others from.
     connection.execute("BEGIN IMMEDIATE")
-    connection.execute("ROLLBACK")
+    if version < SCHEMA_VERSION:
+        for older in range(version, SCHEMA_VERSION):
+            connection.execute(UPGRADES[older])
+        connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+    connection.execute("COMMIT")
 
 
 def _damaged(path: Path | str, what: str) -> ConfigError:
@@ -359,7 +376,9 @@ def _damaged(path: Path | str, what: str) -> ConfigError:
 def _record(row: tuple[Any, ...]) -> UnitRecord:
     fields = dict(zip(UnitRecord.model_fields, row, strict=True))
     pose = fields["T_world_camera"]
-    return UnitRecord.model_validate({**fields, "T_world_camera": None if pose is None else json.loads(pose)})
+    fields["T_world_camera"] = None if pose is None else json.loads(pose)
+    fields["pose_quality"] = json.loads(fields["pose_quality"])
+    return UnitRecord.model_validate(fields)
 
 
 def _put(connection: sqlite3.Connection, name: str, value: Any) -> None:

@@ -18,11 +18,11 @@ import pytest
 
 from master_server import store as store_module
 from master_server.master import Master
-from master_server.store import FILE_NAME, Store, UnitRecord
+from master_server.store import FILE_NAME, SCHEMA_VERSION, Store, UnitRecord
 from shared.cell import Cell, PlacedMesh
 from shared.errors import ConfigError, Refusal
 from shared.meshes import box_mesh
-from shared.messages import Matrix
+from shared.messages import Matrix, PoseQuality
 from shared.settings import Settings
 from shared.waiting import within
 from tests.master_server.fakes import AT_ORIGIN, MS, START_NS, FakeUnit, S, cell, joined, sees_all
@@ -73,7 +73,7 @@ def test_all_that_was_acknowledged_is_there_in_the_next_master(path: Path) -> No
     one = Master(with_box(), Settings(), store)
     joined(one, 1)
     second = joined(one, 2)
-    one.set_pose(second.initialized.id, ELSEWHERE, "operator", None)
+    one.set_pose(second.initialized.id, ELSEWHERE, "board", None, PoseQuality(uncertainty_mm=1.5))
     one.change_settings({"voxel_size_m": 0.1})
     one.forget(joined(one, 3).initialized.id)
     before = (one.versions, one.settings, [slot.record for slot in one.registry])
@@ -90,8 +90,9 @@ def test_all_that_was_acknowledged_is_there_in_the_next_master(path: Path) -> No
     ]
     assert [(row.T_world_camera, row.pose_origin) for row in rows] == [
         (AT_ORIGIN, "configured"),
-        (ELSEWHERE, "operator"),
+        (ELSEWHERE, "board"),
     ]
+    assert [row.pose_quality.uncertainty_mm for row in rows] == [None, 1.5]
     assert not two.view(NOW_NS).complete
     # An id is never given twice.
     assert joined(two, 4).initialized.id == 4
@@ -210,10 +211,25 @@ def test_a_file_of_something_else_is_refused_and_left_alone(path: Path) -> None:
 def test_a_store_of_a_newer_master_is_refused(path: Path) -> None:
     Store.open(path).close()
     newer = sqlite3.connect(path)
-    newer.execute("PRAGMA user_version = 2")
+    newer.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 1}")
     newer.close()
     with pytest.raises(ConfigError, match="newer"):
         Store.open(path)
+
+
+def test_a_store_of_an_older_master_becomes_one_of_this(path: Path) -> None:
+    store = Store.open(path)
+    one = Master(with_box(), Settings(), store)
+    one.set_pose(joined(one, 1).initialized.id, ELSEWHERE, "board", None)
+    units = store.load().units
+    store.close()
+    older = sqlite3.connect(path)
+    older.executescript("ALTER TABLE units DROP COLUMN pose_quality; PRAGMA user_version = 1")
+    older.close()
+    for _ in range(2):
+        with contextlib.closing(Store.open(path)) as opened:
+            assert opened.load().units == units
+            assert opened._connection.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
 
 
 def test_a_damaged_file_is_refused_and_never_replaced(path: Path) -> None:

@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench-pipeline bench-board bench-master bench-stance pictures test lint clean libusb
+.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench-pipeline bench-board bench-master bench-stance viewer-test pictures test lint clean libusb
 
 ARGS ?=
 EXTRAS := edge,master,realsense,sim,dev
@@ -55,6 +55,9 @@ bench-board: $(READY) ## how well a camera's pose is found by a calibration boar
 
 bench-stance: $(READY) ## how soon a knocked or covered camera is told, and how often one is wrongly suspected
 	@$(BIN)/python -m benchmarks.stance $(ARGS)
+
+viewer-test: $(READY) ## the operator's window in a real browser, and what those who look cost the units
+	@$(BIN)/python -m benchmarks.viewer $(ARGS)
 
 pictures: $(READY) ## the pictures of the README, painted anew
 	@$(BIN)/python -m simulation.picture assets/pictures/demo.png

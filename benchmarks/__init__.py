@@ -34,5 +34,7 @@ In the order of the flow:
     traffic      what units send, in the very bytes of their client
     load         a process that sends it for many units, and counts
     bare_fastapi what a master is measured against
+    watchers     people who look at the master's viewer
     master       what one master bears
+    viewer       the operator's window in a real browser, and what those who look cost the units
 """

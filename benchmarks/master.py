@@ -60,9 +60,9 @@ class Bench:
         """Whether the server has a core of its own."""
         return self._server_core != self._load_core
 
-    async def at_rate(self, units: int, voxels: int) -> dict[str, Any]:
-        """A master with so many units of 30 frames a second."""
-        found = await self._run(units, voxels, FRAME_RATE_HZ, False, self._seconds)
+    async def at_rate(self, units: int, voxels: int, viewers: int = 0) -> dict[str, Any]:
+        """A master with so many units of 30 frames a second, and so many who look at its viewer."""
+        found = await self._run(units, voxels, FRAME_RATE_HZ, False, self._seconds, viewers)
         seen = found["bytes_seen"] / max(found["seen_reports"], 1)
         both = (found["bytes_out"] + found["bytes_in"] - found["bytes_seen"]) / max(found["counted"], 1)
         return {
@@ -85,7 +85,9 @@ class Bench:
         per_s = float(found["counted"] / seconds)
         return per_s, 1e4 * found["cpu_percent"] / max(per_s, 1.0)
 
-    async def _run(self, units: int, voxels: int, rate_hz: float | None, bare: bool, seconds: float) -> dict[str, Any]:
+    async def _run(
+        self, units: int, voxels: int, rate_hz: float | None, bare: bool, seconds: float, viewers: int = 0
+    ) -> dict[str, Any]:
         os.sched_setaffinity(0, {self._server_core})
         server, ready = await self._server(bare)
         os.sched_setaffinity(0, {self._load_core})
@@ -98,6 +100,8 @@ class Bench:
                     *("--url", ready["url"], "--token-file", ready["operator_token_file"]),
                 )
             )
+        if viewers:
+            children.append(await self._watchers(ready, viewers))
         token_file = self._folder / "token"
         token_file.write_text("no token is asked for here" if bare else Path(ready["unit_token_file"]).read_text())
         plan = Plan(
@@ -118,6 +122,22 @@ class Bench:
         await self._processes.stop(*children)
         found: dict[str, Any] = json.loads(result.read_text())
         return found
+
+    async def _watchers(self, ready: dict[str, Any], viewers: int) -> Child:
+        """So many who look at the master's viewer, once all of them see something."""
+        seeing = self._folder / "seeing"
+        seeing.unlink(missing_ok=True)
+        watchers = await self._processes.start(
+            "watchers",
+            "benchmarks.watchers",
+            *(ready["url"], ready["operator_token_file"], str(ready["pid"]), str(viewers), str(seeing)),
+        )
+        deadline_ns = monotonic_ns() + round(READY_S * NS_PER_S)
+        while not seeing.exists():
+            if watchers.ended or monotonic_ns() > deadline_ns:
+                raise UplinkError(f"{watchers.name} do not see anything; {watchers.log_tail()}")
+            await asyncio.sleep(POLL_S)
+        return watchers
 
     async def _server(self, bare: bool) -> tuple[Child, dict[str, Any]]:
         ready_file = self._folder / "ready.json"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv4Address
 from pathlib import Path
@@ -62,6 +63,7 @@ class FleetUnit:
     address: str
     run: UnitRun
     child: Child
+    config_path: Path
 
 
 @dataclass(eq=False)
@@ -79,8 +81,8 @@ class Fleet:
         # What the environment says of real units and masters does not hold here.
         self.processes = Processes(self.folder / "logs", without=(UNIT_PREFIX, MASTER_PREFIX))
 
-    async def start_master(self) -> None:
-        """Start it and wait until it can be asked.
+    async def start_master(self, actions: Mapping[str, str] | None = None) -> None:
+        """Start it and wait until it can be asked; `actions` of an operator on a unit are offered by its viewer.
 
         Raises:
             MasterUnreachable: it ended before.
@@ -93,6 +95,7 @@ class Fleet:
             *("--cell", str(DEMO_CELL), "--host", "127.0.0.1", "--port", str(options.port), "--public-reads"),
             *("--state-dir", str(self.folder / "master"), "--ready-file", str(ready_file)),
             *("--set", f"settings.voxel_size_m={options.voxel_size_m}", *LOG_LEVEL),
+            *(part for name, url in (actions or {}).items() for part in ("--set", f"unit_actions.{name}={url}")),
         )
         while not ready_file.exists():
             if self.master.ended:
@@ -101,6 +104,28 @@ class Fleet:
             await asyncio.sleep(POLL_S)
         self._ready: dict[str, Any] = json.loads(ready_file.read_bytes())
         self.url = self._ready["url"]
+
+    @property
+    def operator_token(self) -> str:
+        """Of the master."""
+        return Path(self._ready["operator_token_file"]).read_text().strip()
+
+    async def switch_power(self, verb: str, address: str) -> str | None:
+        """`cut` a unit's power, or `give` it again; returns why not, or None."""
+        unit = next((unit for unit in self.units if unit.address == address), None)
+        if unit is None:
+            return f"expected the address of one of the {len(self.units)} units, got {address}"
+        if verb == "cut":
+            if unit.child.ended:
+                return f"{unit.name} has no power already"
+            unit.child.may_end = True
+            unit.child.process.kill()
+            await unit.child.process.wait()
+        elif not unit.child.ended:
+            return f"{unit.name} has power already"
+        else:
+            unit.child = await self._run_unit(unit.name, unit.config_path)
+        return None
 
     async def start_warm_up(self) -> asyncio.Future[None]:
         """Have all kernels compiled, once for all units. The future is done when they are.
@@ -154,5 +179,8 @@ class Fleet:
         }
         config_path = state_dir / "unit.yaml"
         config_path.write_text(yaml.safe_dump(document, sort_keys=False))
-        child = await self.processes.start(name, "edge_unit", "run", str(config_path), *LOG_LEVEL)
-        self.units.append(FleetUnit(name, address, UnitRun(name, source, trace_path), child))
+        child = await self._run_unit(name, config_path)
+        self.units.append(FleetUnit(name, address, UnitRun(name, source, trace_path), child, config_path))
+
+    async def _run_unit(self, name: str, config_path: Path) -> Child:
+        return await self.processes.start(name, "edge_unit", "run", str(config_path), *LOG_LEVEL)

@@ -6,8 +6,10 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import os
 import sys
 import tempfile
+import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -25,6 +27,7 @@ from shared.wire import MEDIA_TYPE
 from simulation.camera import D435I_FOCAL_PX, MAX_RIG
 from simulation.evaluation import evaluate
 from simulation.fleet import QUIET_S, Fleet, FleetOptions, FleetUnit
+from simulation.power import PowerSwitch
 from simulation.processes import STOP_SIGNALS, raise_when_stopped
 from simulation.table import MapLine, Screen, UnitLine
 from simulation.world import MAX_DEMO_PEOPLE
@@ -40,6 +43,9 @@ DRAIN_S = 0.3
 
 REFRESH_S = 0.5
 """Between two drawings of the table. The list of unseen blocks that it asks for is long."""
+
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
+"""Variables of which one is set where a browser has somewhere to open."""
 
 RESOLUTIONS = ", ".join(f"{width}x{height}" for width, height in D435I_FOCAL_PX)
 
@@ -71,7 +77,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     try:
         with _folder(options.folder) as folder:
             fleet = Fleet(_fleet_options(options), folder)
-            outcome = asyncio.run(_run(fleet, options.seconds, screen))
+            outcome = asyncio.run(_run(fleet, options.seconds, screen, not options.no_browser and not options.json))
             # The event loop took the handlers with it.
             raise_when_stopped()
             screen.leave()
@@ -91,7 +97,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     return 1 if outcome.failures else 0
 
 
-async def _run(fleet: Fleet, seconds: float | None, screen: Screen) -> Outcome:
+async def _run(fleet: Fleet, seconds: float | None, screen: Screen, may_open: bool) -> Outcome:
     """Start everything, watch it until its time is over or someone stops it, stop everything."""
     loop, task = asyncio.get_running_loop(), asyncio.current_task()
     assert task is not None
@@ -106,8 +112,8 @@ async def _run(fleet: Fleet, seconds: float | None, screen: Screen) -> Outcome:
         loop.add_signal_handler(number, stop)
     outcome = Outcome()
     try:
-        async with fleet.processes:
-            await _start(fleet, screen)
+        async with fleet.processes, PowerSwitch(fleet.switch_power) as power:
+            await _start(fleet, screen, power, may_open)
             await _watch(fleet, seconds, screen, outcome)
     except asyncio.CancelledError:
         outcome.stopped = True
@@ -117,10 +123,14 @@ async def _run(fleet: Fleet, seconds: float | None, screen: Screen) -> Outcome:
     return outcome
 
 
-async def _start(fleet: Fleet, screen: Screen) -> None:
-    """Start the fleet; the first thing that is said is where to find it."""
-    await fleet.start_master()
+async def _start(fleet: Fleet, screen: Screen, power: PowerSwitch, may_open: bool) -> None:
+    """Start the fleet; the first thing that is said is where to find it, the second where to see it."""
+    await fleet.start_master(power.actions)
     screen.say(f"Cellwatch demo: {fleet.url} (try: curl {fleet.url}/voxels; Ctrl-C stops)")
+    if link := await _link(fleet):
+        screen.say(f"watch it in a browser: {link} (works once)")
+        if may_open and any(os.environ.get(name) for name in DISPLAYS):
+            await asyncio.to_thread(webbrowser.open, link)
     warm_up = await fleet.start_warm_up()
     try:
         await asyncio.wait((warm_up,), timeout=QUIET_S)
@@ -130,6 +140,14 @@ async def _start(fleet: Fleet, screen: Screen) -> None:
     finally:
         warm_up.cancel()
     await fleet.start_units()
+
+
+async def _link(fleet: Fleet) -> str | None:
+    """A link into the master's viewer, as its operator; None where none is installed."""
+    headers = {"Authorization": f"Bearer {fleet.operator_token}"}
+    async with httpx.AsyncClient(base_url=fleet.url, headers=headers, trust_env=False) as client:
+        answer = await client.post("/viewer/links")
+    return f"{fleet.url}{answer.json()['path']}" if answer.is_success else None
 
 
 async def _watch(fleet: Fleet, seconds: float | None, screen: Screen, outcome: Outcome) -> None:

@@ -39,7 +39,8 @@ STYLE = """<style>
 .cw{font:12px/1.45 system-ui,sans-serif;padding:0 .6em}.cw table{width:100%;border-collapse:collapse}
 .cw th{font-weight:600;text-align:right;opacity:.65}.cw td{text-align:right;padding:.1em .2em}
 .cw th:first-child,.cw td:first-child,.cw th:nth-child(2),.cw td:nth-child(2){text-align:left}
-.cw .why{text-align:left;opacity:.8;padding-bottom:.4em}.cw b{font-weight:600}
+.cw td{white-space:nowrap}.cw td.why{white-space:normal;text-align:left;opacity:.8;padding-bottom:.4em}
+.cw b{font-weight:600}
 </style>"""
 
 PICTURES = ("depth", "expected", "foreground")

@@ -26,8 +26,8 @@ BOX_COLOUR = (60, 60, 60)
 UNSEEN_COLOUR = (110, 80, 150)
 UNSEEN_OPACITY = 0.16
 
-WITNESS_COLOURS = np.array([(225, 110, 0), (215, 50, 10), (160, 10, 20)], np.uint8)
-"""Of voxels that one unit reports, two, and more."""
+WITNESS_COLOURS = np.array([(222, 40, 3), (174, 7, 4), (78, 1, 11)], np.uint8)
+"""Of voxels that one unit reports, two, and more; viser takes them to be linear: orange, red and crimson."""
 
 VOXEL_SHARE = 0.92
 """Of a voxel's edge that is drawn, so that one can tell them apart."""
@@ -47,6 +47,12 @@ BOX_EDGES = np.array(
 
 QUAD = np.array([(0, 1, 2), (0, 2, 3)], np.uint32)
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
+
+VIEW_FROM = np.array([0.75, -1.0, 0.6])
+"""In diagonals of the box, from its middle."""
+
+VIEW_FOV_RAD = 0.8
+"""Of who looks, vertically."""
 
 Points = NDArray[np.float32]
 
@@ -85,6 +91,14 @@ def surface(inside: NDArray[np.bool_], lattice: Lattice) -> tuple[Points, NDArra
     points = np.asarray(lattice.origin_m) + corners * lattice.voxel_size_m
     faces = (np.arange(len(corners) // 4)[:, None, None] * 4 + QUAD).reshape(-1, 3)
     return points.astype(np.float32), faces.astype(np.uint32)
+
+
+def view_of(
+    box_min_m: NDArray[np.float64], box_max_m: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where one first stands and what one looks at: from a corner and above, so that all of the box is seen."""
+    middle, size = (box_min_m + box_max_m) / 2.0, box_max_m - box_min_m
+    return middle + VIEW_FROM * float(np.linalg.norm(size)), middle - (0.0, 0.0, 0.05 * size[2])
 
 
 class Scene:
@@ -136,10 +150,10 @@ class Scene:
             )
             for i, link in enumerate(cell.robot.links if cell.robot else ())
         ]
-        # From a corner and above, so that all of the box is in the picture.
-        eye = middle + np.array([0.62, -0.82, 0.5]) * float(np.linalg.norm(size))
+        eye, target = view_of(low, high)
         self._server.initial_camera.position = eye
-        self._server.initial_camera.look_at = middle - (0.0, 0.0, 0.15 * size[2])
+        self._server.initial_camera.look_at = target
+        self._server.initial_camera.fov = VIEW_FOV_RAD
 
     def set_joints(self, positions: tuple[float, ...] | None) -> None:
         """The robot stands so; without positions it is not drawn."""

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A real browser without a screen, and all that it asked for and complained of."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
+
+WIDTH, HEIGHT = 1280, 800
+
+LOAD_MS = 90_000
+"""For the first picture: without a graphics card, and with two cores for everything, shaders take their time."""
+
+# Without a graphics card WebGL is reckoned by SwiftShader.
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+LOCAL_SCHEMES = ("data", "blob")
+
+OUT = os.environ.get("CELLWATCH_VIEWER_OUT")
+"""Where pictures are kept for people to look at."""
+
+
+def chromium() -> str:
+    """Where the browser is; without one a test is skipped, except where CI is set: there it fails."""
+    path = shutil.which("chromium") or shutil.which("chromium-browser")
+    if path is None:
+        reason = "no browser: expected Debian's chromium (scripts/system-packages installs it)"
+        if os.environ.get("CI"):
+            pytest.fail(reason, pytrace=False)
+        pytest.skip(reason)
+    return path
+
+
+@dataclass
+class Witness:
+    """What a browser asked for, and what went wrong in it."""
+
+    asked: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+
+    def watch(self, context: BrowserContext) -> None:
+        """Keep all of it from now on."""
+        context.on("request", lambda request: self.asked.append(request.url))
+        context.on("console", lambda said: self.errors.append(said.text) if said.type == "error" else None)
+        context.on("weberror", lambda error: self.errors.append(str(error.error)))
+
+    def foreign(self, origin: str) -> list[str]:
+        """What was asked of anyone but `origin`."""
+        host = urlsplit(origin).netloc
+        parts = [(url, urlsplit(url)) for url in self.asked]
+        return [url for url, part in parts if part.scheme not in LOCAL_SCHEMES and part.netloc != host]
+
+
+@contextmanager
+def a_browser() -> Iterator[Browser]:
+    """Chromium, as Debian has it."""
+    path = chromium()
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+def opened(context: BrowserContext, link: str) -> Page:
+    """The window, once it shows the table of units and a picture."""
+    page = context.new_page()
+    page.set_default_timeout(LOAD_MS)
+    page.goto(link)
+    page.wait_for_selector('[data-cellwatch="units"]', state="attached")
+    page.wait_for_selector("canvas")
+    return page
+
+
+def shot(page: Page, name: str) -> NDArray[np.uint8]:
+    """What is on the screen now, (H, W, 3); kept as `name` where pictures are kept."""
+    data = page.screenshot()
+    if OUT:
+        folder = Path(OUT)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{name}.png").write_bytes(data)
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))

@@ -33,6 +33,9 @@ In the order of the flow:
     recorded_delay  the same by a recording
     delay_watch     the same while a unit runs, as a warning
     trust           which master a unit believes, by its certificate
+    config          the unit's own configuration
+    master_choice   which of the masters that were heard of is ours
+    master_search   looks for the master while it does not answer
     client          what a unit can ask the master
     cell_cache      the master's cell, kept on disk
     uplink          the exchange with the master: latest wins
@@ -41,7 +44,6 @@ In the order of the flow:
     camera_memory   the camera that was here, so that its absence can be told
     trace           what was reported, frame by frame, in a file
     progress        whether the work on frames makes progress
-    config          the unit's own configuration
     unit            the daemon: source, pipeline and uplink held together
     host            what the computer itself tells: its clock, its USB
     doctor          is all there that a unit needs, and what is to be done if not

@@ -57,7 +57,7 @@ class MasterClient:
 
     def __init__(
         self,
-        url: str,
+        url: str | None,
         read_token: Callable[[], str],
         source_address: str | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
@@ -66,28 +66,43 @@ class MasterClient:
         """`read_token` is asked at each registration; `source_address` is an own IP to connect from.
 
         `transport` carries the requests in place of a network. `tls` is what is asked of the master's certificate,
-        see `trust`; without, a master at https is held against the CAs of the system.
+        see `trust`; without, a master at https is held against the CAs of the system. With `url` None there is no
+        master until `aim` names one.
         """
-        self.url = url.rstrip("/")
         self._read_token = read_token
-        parts = urlsplit(self.url)
-        if not parts.hostname:
-            raise ConfigError(f"master_url: expected http://host:port, got {url}")
-        if tls is not None and parts.scheme != "https":
-            raise ConfigError(f"master_url: expected https, since the master's certificate is to be checked, got {url}")
+        self._tls = tls
+        self.url = ""
+        """Empty: there is no master yet."""
         if transport is None:
-            verify = tls or (tls_context() if parts.scheme == "https" else False)
-            transport = httpx.AsyncHTTPTransport(verify=verify, local_address=source_address, limits=LIMITS)
+            # Also where this master speaks no TLS: another one may.
+            transport = httpx.AsyncHTTPTransport(
+                verify=tls or tls_context(), local_address=source_address, limits=LIMITS
+            )
         self._http = httpx.AsyncClient(
-            base_url=self.url,
             transport=transport,
             timeout=TIMEOUT,
             # No proxy from the environment: the master is on our own network.
             trust_env=False,
         )
+        if url is not None:
+            self.aim(url)
         # They would cost a hundred bytes in every update and tell the master nothing.
         for name in ("Accept", "Accept-Encoding", "Connection", "User-Agent"):
             del self._http.headers[name]
+
+    def aim(self, url: str) -> None:
+        """Talk to the master at `url` from now on.
+
+        Raises:
+            ConfigError: it is no URL, or not https although the master's certificate is to be checked.
+        """
+        parts = urlsplit(url)
+        if not parts.hostname:
+            raise ConfigError(f"master_url: expected http://host:port, got {url}")
+        if self._tls is not None and parts.scheme != "https":
+            raise ConfigError(f"master_url: expected https, since the master's certificate is to be checked, got {url}")
+        self.url = url.rstrip("/")
+        self._http.base_url = httpx.URL(self.url)
 
     async def __aenter__(self) -> MasterClient:
         await self.authorize()
@@ -161,6 +176,8 @@ class MasterClient:
         timeout: httpx.Timeout | float = TIMEOUT,
         limit: int = MAX_ANSWER_BYTES,
     ) -> bytes:
+        if not self.url:
+            raise MasterUnreachable("no master is known yet")
         received = bytearray()
         try:
             async with self._http.stream(method, path, content=body, headers=headers, timeout=timeout) as response:

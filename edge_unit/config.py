@@ -18,11 +18,10 @@ from edge_unit.sources.recorded import RecordedSourceConfig, read_pose
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from edge_unit.trust import normalised, tls_context
 from shared.errors import ConfigError
+from shared.messages import MAX_TEXT
 from shared.transforms import Transform, from_xyz_rpy, validated
 
 ENVIRONMENT_PREFIX = "CELLWATCH_UNIT_"
-
-DEFAULT_MASTER_URL = "http://127.0.0.1:8420"
 
 MAX_FPS = 300.0
 """No depth camera delivers more."""
@@ -80,7 +79,14 @@ class UnitConfig(Configured):
     """From a YAML file, `CELLWATCH_UNIT_*` variables and flags. Only `source` has no default."""
 
     source: SourceConfig
-    master_url: str = Field(default=DEFAULT_MASTER_URL, pattern=r"^https?://[^/\s]+/?$")
+    master_url: str | None = Field(
+        default=None, pattern=r"^https?://[^/\s]+/?$", description="Where the master is; left out, it is looked for."
+    )
+    cell: str | None = Field(
+        default=None,
+        max_length=MAX_TEXT,
+        description="Name of the cell whose master is meant, where several are found.",
+    )
     master_ca: Path | None = Field(
         default=None, description="Certificates (PEM) of the CA that signed the master's; no other master is believed."
     )
@@ -119,7 +125,7 @@ class UnitConfig(Configured):
 
     @model_validator(mode="after")
     def _believed_over_tls_only(self) -> UnitConfig:
-        if self.checks_master and not self.master_url.startswith("https://"):
+        if self.checks_master and self.master_url is not None and not self.master_url.startswith("https://"):
             raise ValueError(
                 f"master_url: expected https://, since master_ca or master_fingerprint is set, got {self.master_url}"
             )

@@ -22,12 +22,16 @@ from edge_unit.client import MasterClient
 from edge_unit.config import UnitConfig
 from edge_unit.host import clock_is_set, usb_cameras
 from edge_unit.jit_cache import PRIVATE, settle
+from edge_unit.master_choice import Place, choose, first_place
+from edge_unit.master_search import judged, kept_of, reach, wanted_of
 from edge_unit.sources import capture_link as link
 from edge_unit.sources.capture_session import CaptureSession
 from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
 from edge_unit.sources.realsense import RealsenseSource, RealsenseSourceConfig
+from edge_unit.trust import tls_context
 from shared.cell import Cell
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns, wall_ns
+from shared.discovery import Browser
 from shared.errors import CellwatchError, ConfigError, MasterRefused, SourceError
 from shared.messages import UpdateRequest, Versions
 from shared.settings import FilterSettings
@@ -53,6 +57,9 @@ BUDGET_OK = 0.7
 
 ROUND_TRIP_OK_MS = 20.0
 """Half of it is how far the robot's joints may be off in time: at 1 rad/s and 1 m reach, a centimetre."""
+
+LISTEN_S = 2.0
+"""For masters to be heard of; they answer within a fifth of a second."""
 
 SURVEY_S = 15.0
 """For the SDK to look for cameras."""
@@ -97,11 +104,18 @@ async def examine(config: UnitConfig, seconds: float = MEASURE_S) -> AsyncIterat
     yield await asyncio.to_thread(software)
     yield clock()
     cell: Cell | None = None
-    async for found in _master(config):
-        if isinstance(found, Cell):
-            cell = found
+    place: Place | None = None
+    async for heard in _network(config):
+        if isinstance(heard, Place):
+            place = heard
         else:
-            yield found
+            yield heard
+    if place is not None:
+        async for found in _master(config, place):
+            if isinstance(found, Cell):
+                cell = found
+            else:
+                yield found
     source = config.source
     if isinstance(source, RealsenseSourceConfig):
         async for finding in _cameras(source):
@@ -168,11 +182,37 @@ def stream(info: CameraInfo, measured: Measured, wanted_fps: float | None) -> It
         )
 
 
-async def _master(config: UnitConfig) -> AsyncIterator[Finding | Cell]:
+async def _network(config: UnitConfig) -> AsyncIterator[Finding | Place]:
+    """The masters that are announced, what speaks against each, and where a unit would turn to."""
+    try:
+        tls = await asyncio.to_thread(config.tls) or tls_context()
+    except ConfigError as error:
+        yield Finding("FAIL", "master", f"{error}; correct the configuration")
+        return
+    wanted, kept = wanted_of(config), await asyncio.to_thread(kept_of, config)
+    async with Browser() as browser:
+        await asyncio.sleep(LISTEN_S)
+        candidates = await judged(await browser.offers(), wanted, kept, tls, config.source_address)
+    for candidate in candidates:
+        yield Finding("ok", "network", f"there is {candidate}")
+    chosen, words = choose(candidates)
+    place = first_place(wanted, kept)
+    if chosen is not None and chosen.url is not None:
+        if place is None or (place.url != chosen.url and await reach(place.url, tls, config.source_address)):
+            place = Place(chosen.url, words)
+    elif not candidates:
+        yield Finding("ok" if place is not None else "warning", "network", words)
+    if place is not None:
+        yield place
+    else:
+        yield Finding("FAIL", "master", f"{words}; start it on this network, or set master_url")
+
+
+async def _master(config: UnitConfig, place: Place) -> AsyncIterator[Finding | Cell]:
     """Whether the master is there and takes our token; the cell that it watches, if it gives it."""
     try:
         tls = await asyncio.to_thread(config.tls)
-        client = MasterClient(config.master_url, config.read_token, config.source_address, tls=tls)
+        client = MasterClient(place.url, config.read_token, config.source_address, tls=tls)
     except ConfigError as error:
         yield Finding("FAIL", "master", f"{error}; correct the configuration")
         return
@@ -195,10 +235,12 @@ async def _master(config: UnitConfig) -> AsyncIterator[Finding | Cell]:
             yield Finding("FAIL", "master", f"{error}; is it running, and is master_url right?")
             return
         if trip_ms <= ROUND_TRIP_OK_MS:
-            yield Finding("ok", "master", f"{client.url} answers within {trip_ms:.1f} ms")
+            yield Finding("ok", "master", f"{client.url} ({place.found_by}) answers within {trip_ms:.1f} ms")
         else:
             yield Finding(
-                "warning", "master", f"{client.url} takes {trip_ms:.0f} ms to answer; use a cable, not a radio network"
+                "warning",
+                "master",
+                f"{client.url} ({place.found_by}) takes {trip_ms:.0f} ms to answer; use a cable, not a radio network",
             )
         yield await _token(client)
         try:

@@ -30,6 +30,7 @@ from edge_unit.client import MasterClient
 from edge_unit.config import SourceConfig, UnitConfig
 from edge_unit.delay_watch import DelayWatch
 from edge_unit.joints import JointEstimate
+from edge_unit.master_search import MasterSearch
 from edge_unit.pictures import picture_raw, png_of
 from edge_unit.pipeline import EXACT, DepthPipeline
 from edge_unit.progress import Progress
@@ -109,9 +110,11 @@ class Unit:
         """
         self._config = config
         self._source = source
-        self._client = client or MasterClient(
-            config.master_url, config.read_token, config.source_address, tls=config.tls()
-        )
+        self._masters: MasterSearch | None = None
+        if client is None:
+            self._masters = MasterSearch(config)
+            client = MasterClient(config.master_url, config.read_token, config.source_address, tls=config.tls())
+        self._client = client
         configured = config.T_world_camera
         self._pose: tuple[Transform, ToldOrigin] | None = (
             None if configured is None else (configured.transform(), "configured")
@@ -141,6 +144,7 @@ class Unit:
             f"edge-unit {importlib.metadata.version('cellwatch')}",
             _boot_id(),
             self._note,
+            self._masters,
         )
 
     async def run(self) -> None:
@@ -152,6 +156,8 @@ class Unit:
         """
         async with self._client:
             tasks = [asyncio.create_task(self.uplink.run()), asyncio.create_task(self._watch())]
+            if self._masters is not None:
+                tasks.append(asyncio.create_task(self._masters.run()))
             if isinstance(self._source, ReportsStatus):
                 tasks.append(asyncio.create_task(self._follow_status(self._source)))
             try:

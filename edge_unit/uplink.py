@@ -3,6 +3,17 @@
 
 A slot of one: a report that was not sent yet is replaced by a newer one, so that a slow network costs frames and
 never delay. Whatever goes wrong, it registers again; the master may have been restarted, or may be another.
+
+How far it has come is its phase; each has its own way of trying again, and each change is one line in the journal:
+
+    searching ───► registering ───► fetching ───► localising ───► live
+     for a place    at that place    the cell      the camera,     every frame
+     every 2 s,     every 50 to      that is not   by the board,   is filtered
+     and when       250 ms           on disk       for ever        and reported
+     one is heard       ▲            already           ▲              │
+     of                 ├────────────────┴─────────────┼──────────────┤ it does not know us any more
+        ▲               │                              └──────────────┤ the pose is void
+        └───────────────┴─────────────────────────────────────────────┘ nobody answered for 2 s
 """
 
 from __future__ import annotations
@@ -16,21 +27,24 @@ from dataclasses import dataclass, field, replace
 from edge_unit.cell_cache import CellCache
 from edge_unit.client import MasterClient
 from edge_unit.joints import JointHistory
+from edge_unit.master_search import MasterSearch
 from edge_unit.sources.frame import CameraInfo
 from edge_unit.visibility import SeenBlocks
 from shared.cell import Cell
 from shared.clock import monotonic_ns
-from shared.errors import CellwatchError, ConfigError, MasterRefused
+from shared.errors import CellwatchError, ConfigError, MasterRefused, MasterUnreachable, WireError
 from shared.lattice import Lattice
 from shared.messages import (
     CONTRACT_VERSION,
     DONE,
     MAX_COMMANDS,
     MAX_TEXT,
+    CellReference,
     Command,
     Health,
     InitializeRequest,
     Outcome,
+    Phase,
     PoseQuality,
     SeenReport,
     ToldOrigin,
@@ -56,6 +70,9 @@ RETRY_MAX_S = 0.25
 
 JOINTS_TIMEOUT_S = 0.02
 """For joints newer than the last update brought; a frame is not held up longer for them."""
+
+NOT_OURS = frozenset({400, 401, 403, 404, 405, 426})
+"""Who answers a registration like this is no master for us: of another contract or token, or none at all."""
 
 START_OVER = frozenset({401, 403, 404, 409})
 """The master does not know this token, unit, session or address any more: register again."""
@@ -94,9 +111,14 @@ class Uplink:
         software: str,
         boot_id: str,
         on_sent: Callable[[Report, int | None], None],
+        search: MasterSearch | None = None,
     ) -> None:
-        """`on_sent` is told of each report: when the master had merged it, by the unit's clock; None: it never was."""
+        """`on_sent` is told of each report: when the master had merged it, by the unit's clock; None: it never was.
+
+        `search` tells where the master is; without, it is where the client was aimed at, for ever.
+        """
         self._client = client
+        self._search = search
         self._cells = cells
         self._software = software
         self._boot_id = boot_id
@@ -111,12 +133,14 @@ class Uplink:
         self._exchange: Exchange | None = None
         self._acknowledged: tuple[Versions, bytes] | None = None
         self._complaint = ""
+        self._found_by = ""
         self._id = 0
         self._sequence = 0
         self._done: list[Outcome] = []
         self._open_commands: dict[int, Command] = {}
         self.assignment: Assignment | None = None
         self.assigned = asyncio.Event()
+        self.phase: Phase | None = None
         self.commands: asyncio.Queue[Command] = asyncio.Queue(MAX_COMMANDS)
         self.joints = JointHistory()
         self.clock = ClockOffset()
@@ -173,6 +197,8 @@ class Uplink:
     @property
     def standing(self) -> str:
         """How it stands with the master, in words for a person."""
+        if self._search is not None and not self._client.url:
+            return f"no master: {self._search.outcome}"
         if self._complaint:
             return f"no master: {self._complaint}"
         if self.assignment is None:
@@ -202,20 +228,56 @@ class Uplink:
         retry_s = RETRY_MIN_S
         while True:
             try:
+                await self._turn_to_master()
                 assignment = self.assignment
                 if assignment is None:
                     await self._register()
                 else:
                     await self._report(assignment)
                 retry_s, self._complaint = RETRY_MIN_S, ""
+                if self._search is not None:
+                    self._search.answered(self._client.url)
+                if self.phase == "searching" and self.assignment is not None:
+                    self._enter(_phase_of(self.assignment), f"{self._client.url} answers again")
             except MasterRefused as error:
                 if error.status in START_OVER and self.assignment is not None:
                     self._start_over()
+                self._miss(error, error.status in NOT_OURS and self.assignment is None)
                 retry_s = await self._wait(retry_s, error)
             except CellwatchError as error:
+                foreign = isinstance(error, WireError) and self.assignment is None
+                self._miss(error, foreign or isinstance(error, MasterUnreachable))
                 retry_s = await self._wait(retry_s, error)
 
+    async def _turn_to_master(self) -> None:
+        """To another one, if another was found; while none is known at all, wait."""
+        if self._search is None:
+            return
+        if not self._client.url:
+            self._enter("searching", self._search.outcome)
+        place = await self._search.place()
+        if place.url != self._client.url:
+            self._client.aim(place.url)
+            self._found_by = place.found_by
+            self._start_over()
+
+    def _miss(self, error: CellwatchError, lost: bool) -> None:
+        """What went wrong may mean that the master is elsewhere."""
+        if self._search is not None and lost:
+            self._search.unanswered(monotonic_ns())
+            if self._search.lost:
+                self._enter("searching", str(error))
+
+    def _enter(self, phase: Phase, reason: str) -> None:
+        """Be in this phase from now on, and say so if it is another one."""
+        if phase != self.phase:
+            before = f"{self.phase} → " if self.phase else ""
+            logger.info("%s%s: %s", before, phase, reason)
+            self.phase = phase
+
     async def _register(self) -> None:
+        if self._search is None or not self._search.lost:
+            self._enter("registering", f"at {self._client.url}{f', {self._found_by}' if self._found_by else ''}")
         while self._camera is None:
             self._wake.clear()
             await self._wake.wait()
@@ -249,10 +311,17 @@ class Uplink:
         # Those of the session before; the master sends again what it still wants.
         while not self.commands.empty():
             self.commands.get_nowait()
-        cell = await self._cells.get(answer.cell, self._client)
+        self._enter("fetching", f"unit {answer.id}, cell {answer.cell.name}")
+        cell = await self._get_cell(answer.cell)
         pose = None if answer.T_world_camera is None else validated(answer.T_world_camera, "T_world_camera")
-        self._assign(Assignment(answer.session, answer.versions, answer.settings, answer.lattice.lattice(), cell, pose))
-        logger.info("registered at %s as unit %d", self._client.url, answer.id)
+        assignment = Assignment(answer.session, answer.versions, answer.settings, answer.lattice.lattice(), cell, pose)
+        self._assign(assignment, f"registered at {self._client.url} as unit {answer.id}, ")
+
+    async def _get_cell(self, reference: CellReference) -> Cell:
+        cell = await self._cells.get(reference, self._client)
+        if self._search is not None:
+            await self._search.keep(self._client.url, reference.name)
+        return cell
 
     async def _report(self, assignment: Assignment) -> None:
         """Send the latest report, or, when none comes, the one before again."""
@@ -321,6 +390,7 @@ class Uplink:
                 health=health,
                 joints_until_ns=self.joints.newest_ns,
                 done=done,
+                phase=_phase_of(assignment),
             )
         )
         self._exchange = Exchange(sent_at_ns, answer.received_at_ns, answer.answered_at_ns, monotonic_ns())
@@ -342,7 +412,7 @@ class Uplink:
         if answer.lattice is not None:
             changed = replace(changed, lattice=answer.lattice.lattice())
         if answer.cell is not None:
-            changed = replace(changed, cell=await self._cells.get(answer.cell, self._client))
+            changed = replace(changed, cell=await self._get_cell(answer.cell))
         if answer.versions.pose != assignment.versions.pose:
             pose = answer.T_world_camera
             changed = replace(changed, T_world_camera=None if pose is None else validated(pose, "T_world_camera"))
@@ -361,9 +431,11 @@ class Uplink:
             self._done.remove(outcome)
             self._open_commands.pop(outcome.id, None)
 
-    def _assign(self, assignment: Assignment) -> None:
+    def _assign(self, assignment: Assignment, how: str = "") -> None:
         self.assignment = assignment
         self.assigned.set()
+        pose = "nobody knows its camera's pose" if assignment.T_world_camera is None else "its camera's pose is known"
+        self._enter(_phase_of(assignment), f"{how}{pose}")
 
     def _start_over(self) -> None:
         self.assignment = None
@@ -378,6 +450,10 @@ class Uplink:
         logger.log(level, "%s", error)
         await asyncio.sleep(retry_s * random.uniform(0.8, 1.2))
         return min(2.0 * retry_s, RETRY_MAX_S)
+
+
+def _phase_of(assignment: Assignment) -> Phase:
+    return "localising" if assignment.T_world_camera is None else "live"
 
 
 def seen_report(seen: SeenBlocks) -> SeenReport:

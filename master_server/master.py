@@ -402,6 +402,7 @@ class Master:
         slot.arrived_at_ns = now_ns
         slot.versions = update.versions
         slot.health = update.health
+        slot.phase = update.phase
         slot.keys = keys
         if update.exchange is not None:
             slot.clock.add(update.exchange)

@@ -26,6 +26,7 @@ from shared.messages import (
     InitializeRequest,
     Matrix,
     Outcome,
+    Phase,
     PoseOrigin,
     PoseQuality,
     State,
@@ -96,6 +97,7 @@ class Slot:
     versions: Versions = field(default_factory=Versions)
     keys: NDArray[np.uint32] = field(default_factory=lambda: NO_KEYS)
     health: Health = field(default_factory=Health)
+    phase: Phase = "registering"
     told_pose: Matrix | None = None
     warning: str = ""
     asked: deque[_Asked] = field(default_factory=deque)
@@ -133,6 +135,7 @@ class Slot:
         self.captures_ns.clear()
         self.keys = NO_KEYS
         self.health = Health()
+        self.phase = "fetching"
         self.told_pose = told_pose
         self.warning = _pose_warning(self.record, told_pose)
 
@@ -259,6 +262,7 @@ class Slot:
             software=self.record.software,
             state=state,
             reason=reason,
+            phase=self.phase,
             age_s=None if age_s is None else round(age_s, 4),
             arrival_age_s=None if arrival_age_s is None else round(arrival_age_s, 4),
             clock_uncertainty_ms=None if uncertainty_ns is None else round(uncertainty_ns / NS_PER_MS, 3),

@@ -29,6 +29,9 @@ from shared.waiting import within
 
 logger = logging.getLogger(__name__)
 
+# It warns of every packet that cannot be sent while a cable is out; we begin anew then, and say so once.
+logging.getLogger("zeroconf").setLevel(logging.ERROR)
+
 SERVICE_TYPE = "_cellwatch._tcp.local."
 
 TTL_S = 120
@@ -63,6 +66,9 @@ POLL_S = 5.0
 
 RTMGRP_IPV4_IFADDR = 0x10
 """Of rtnetlink: an IPv4 address came or went."""
+
+INTERNAL = ("docker", "br-", "veth", "virbr", "lxc", "cni", "l4tbr")
+"""Interfaces to containers and virtual machines, and a Jetson's USB console, which has one address on all of them."""
 
 ANYWHERE = ("0.0.0.0", "::")
 
@@ -140,8 +146,9 @@ def shortened(text: str, max_bytes: int = MAX_TXT_BYTES) -> str:
 
 
 def own_addresses() -> tuple[IPv4Interface, ...]:
-    """This machine's IPv4 addresses with their networks, in order."""
-    ips = [ip for adapter in ifaddr.get_adapters() for ip in adapter.ips if ip.is_IPv4]
+    """This machine's IPv4 addresses with their networks, in order; not those that lead only to guests on it."""
+    adapters = [adapter for adapter in ifaddr.get_adapters() if not adapter.nice_name.startswith(INTERNAL)]
+    ips = [ip for adapter in adapters for ip in adapter.ips if ip.is_IPv4]
     return tuple(sorted({IPv4Interface(f"{ip.ip}/{ip.network_prefix}") for ip in ips}))
 
 

@@ -18,7 +18,7 @@ from shared.settings import Settings
 from shared.timebase import Exchange
 from shared.transforms import Transform, validated
 
-CONTRACT_VERSION = 4
+CONTRACT_VERSION = 5
 """Rises when a unit of the old contract and a master of the new one can no longer work together."""
 
 MAX_TEXT = 200
@@ -74,6 +74,7 @@ Matrix = tuple[
     tuple[float, float, float, float],
     tuple[float, float, float, float],
 ]
+Phase = Literal["searching", "registering", "fetching", "localising", "live"]
 State = Literal["uncalibrated", "live", "stale", "blind", "moved"]
 Verb = Literal["learn_background", "drop_background", "calibrate", "refine", "image"]
 ImageKind = Literal["depth", "expected", "foreground"]
@@ -255,6 +256,7 @@ class UpdateRequest(Message):
     health: Health = Health()
     joints_until_ns: Nanoseconds = Field(default=0, description="The newest joints that the unit has.")
     done: tuple[Outcome, ...] = Field(default=(), max_length=MAX_COMMANDS, description="Commands that came to an end.")
+    phase: Phase = Field(default="live", description="How far the unit has come since it started.")
 
 
 class UpdateAnswer(Message):
@@ -336,6 +338,7 @@ class UnitRow(Message):
     software: str
     state: State
     reason: str
+    phase: Phase = Field(default="live", description="How far it has come: registering, fetching, localising, live.")
     age_s: float | None = Field(description="Since the capture of its last frame.")
     arrival_age_s: float | None = Field(description="Since its last update arrived.")
     clock_uncertainty_ms: float | None

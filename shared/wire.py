@@ -10,6 +10,7 @@ The body of `/update` is a msgpack map of the fields of `UpdateRequest` that are
     keys                                binary, 4 bytes a voxel: ascending little-endian uint32
     seen                                map, only when it changed: at most 4 kB (see `pack_seen`)
     health                              array of 10 values, some 50 bytes
+    phase                               text, only while the unit is not live
 
 and its answer those of `UpdateAnswer`, where each joint sample is `[at_ns, positions, velocities]`
 with little-endian float32 as binary. `versions` and `health` are the values of their fields in order: at 30 updates a

@@ -100,6 +100,7 @@ async def test_with_a_recording_all_but_the_master_is_looked_at(tmp_path: Path) 
     levels.pop("clock")
     assert levels == {
         "software": "ok",
+        "network": "ok",
         "master": "FAIL",
         "sdk": "ok",
         "camera": "ok",

@@ -41,7 +41,8 @@ def test_all_is_well_and_the_master_is_not_changed(cluster: Cluster) -> None:
     status, levels = doctor(config)
     levels.pop("clock")
     assert status == 0
-    expected = ("software", "master", "token", "cell", "sdk", "camera", "stream", "depth", "kernels", "pipeline")
+    found = ("software", "network", "master", "token", "cell")
+    expected = (*found, "sdk", "camera", "stream", "depth", "kernels", "pipeline")
     assert levels == dict.fromkeys(expected, "ok")
     assert cluster.get("/units") == []
 

@@ -1,0 +1,22 @@
+#!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
+# Installs Cellwatch on the computer that it is run on: a Jetson that has been set up already, or the master's.
+#   sudo deploy/image/install.sh --wheelhouse wheels --token unit.token [--master URL] [--ca ca.pem]
+#   sudo deploy/image/install.sh --role master --wheelhouse wheels --cell my-cell/
+# Options are those of customize-rootfs. Run again with a newer wheelhouse it updates; the release before stays beside it.
+set -euo pipefail
+here=$(cd "$(dirname "$0")" && pwd)
+
+"$here/customize-rootfs" / "$@"
+
+service=edge-unit
+case " $* " in *" --role master "*) service=master-server ;; esac
+systemctl daemon-reload
+systemctl restart systemd-journald.service
+if [ "$service" = edge-unit ]; then
+    udevadm control --reload
+    # Cameras that are plugged in already.
+    udevadm trigger --subsystem-match=usb --subsystem-match=hidraw
+fi
+systemctl restart "$service.service"
+systemctl --no-pager --lines=5 status "$service.service"

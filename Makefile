@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench-pipeline bench-board bench-master bench-stance viewer-test pictures test lint clean libusb
+.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench-pipeline bench-board bench-master bench-stance viewer-test rehearsal pictures test lint clean libusb
 
 ARGS ?=
 EXTRAS := edge,master,realsense,sim,dev
@@ -58,6 +58,9 @@ bench-stance: $(READY) ## how soon a knocked or covered camera is told, and how 
 
 viewer-test: $(READY) ## the operator's window in a real browser, and what those who look cost the units
 	@$(BIN)/python -m benchmarks.viewer $(ARGS)
+
+rehearsal: $(READY) ## a master and three units as machines that boot from what a board is given (root, systemd-nspawn)
+	@$(BIN)/python -m benchmarks.rehearsal $(ARGS)
 
 pictures: $(READY) ## the pictures of the README, painted anew
 	@$(BIN)/python -m simulation.picture assets/pictures/demo.png

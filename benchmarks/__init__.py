@@ -37,4 +37,6 @@ In the order of the flow:
     watchers     people who look at the master's viewer
     master       what one master bears
     viewer       the operator's window in a real browser, and what those who look cost the units
+    machines     machines that boot systemd from one read-only root file system
+    rehearsal    three units and a master as such machines: switched on, failing, coming back
 """

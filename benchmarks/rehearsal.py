@@ -159,6 +159,7 @@ class Fault:
     what: str
     back_s_max: float
     strike: Callable[[Site], Callable[[], object] | None]
+    prepare: Callable[[Site], None] | None = None
 
 
 def unit_crashes(site: Site) -> None:
@@ -171,14 +172,18 @@ def unit_stands_still(site: Site) -> None:
     site.units[0].kill(UNIT, signal.SIGSTOP)
 
 
-def frame_hangs(site: Site) -> None:
-    """The event loop runs and talks to the master, the thread that filters does not come back."""
+def let_frames_hang(site: Site) -> None:
+    """Have the unit run as one that hangs when it is told to."""
     unit = site.units[0]
     drop_in = "/run/systemd/system/edge-unit.service.d"
     unit.run("sh", "-c", f"mkdir -p {drop_in} && cp /opt/hanging-unit/hang.conf {drop_in}/ && systemctl daemon-reload")
     unit.run("systemctl", "restart", UNIT)
     site.until_not_live(unit)
-    site.until_live(unit)
+
+
+def frame_hangs(site: Site) -> None:
+    """The event loop runs and talks to the master, the thread that filters does not come back."""
+    unit = site.units[0]
     pid = unit.show(UNIT, "MainPID")
     # Its watchdog takes the process that hangs, and what hung it is gone when the next one begins.
     unit.run("touch", "/run/hang")
@@ -221,7 +226,13 @@ def disk_is_full(site: Site) -> None:
 FAULTS = (
     Fault("unit-crashes", "SIGSEGV", RESTART_S_MAX, unit_crashes),
     Fault("unit-stands-still", "SIGSTOP: the watchdog strikes", WATCHDOG_S + RESTART_S_MAX, unit_stands_still),
-    Fault("frame-hangs", "one thread hangs: the watchdog strikes", WATCHDOG_S + RESTART_S_MAX, frame_hangs),
+    Fault(
+        "frame-hangs",
+        "one thread hangs: the watchdog strikes",
+        WATCHDOG_S + RESTART_S_MAX,
+        frame_hangs,
+        let_frames_hang,
+    ),
     Fault("unit-loses-power", "and is switched on again", RESTART_S_MAX, unit_loses_power),
     Fault("master-crashes", "SIGSEGV", RESTART_S_MAX, master_crashes),
     Fault("master-stands-still", "SIGSTOP: the watchdog strikes", WATCHDOG_S + RESTART_S_MAX, master_stands_still),
@@ -233,6 +244,8 @@ FAULTS = (
 def strike(site: Site, fault: Fault) -> dict[str, Any]:
     """One fault, from its beginning until the first unit is live again."""
     unit = site.units[0]
+    if fault.prepare is not None:
+        fault.prepare(site)
     site.until_live(unit)
     began_ns = monotonic_ns()
     undo = fault.strike(site)

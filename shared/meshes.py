@@ -39,6 +39,13 @@ MAX_COORDINATE_M = 1000.0
 CIRCLE_SEGMENTS = 48
 """A cylinder of 0.1 m radius is then nowhere more than 0.2 mm inside the true one."""
 
+_BOX_CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_BOX_FACES = np.array((
+    (1, 3, 0), (4, 1, 0), (0, 3, 2), (2, 4, 0), (1, 7, 3), (5, 1, 4),
+    (5, 7, 1), (3, 7, 2), (6, 4, 2), (2, 7, 6), (6, 5, 4), (7, 5, 6),
+))  # fmt: skip
+"""A unit rehearses with boxes, and need not pay for imports either."""
+
 _HEADER = struct.Struct("<4sIII")
 _MAGIC = b"CWM1"
 
@@ -227,7 +234,7 @@ def mesh_by_hash(meshes: Mapping[str, bytes | TriangleMesh], sha256: str, name: 
 
 def box_mesh(name: str, size_m: ArrayLike) -> TriangleMesh:
     """A box about the origin, `size_m` (3,) its edges."""
-    return _primitive(name, "box", extents=np.asarray(size_m, dtype=np.float64))
+    return TriangleMesh.of_triangles(name, _BOX_CORNERS * np.asarray(size_m, dtype=np.float64), _BOX_FACES)
 
 
 def cylinder_mesh(name: str, radius_m: float, length_m: float) -> TriangleMesh:

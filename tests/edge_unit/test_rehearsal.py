@@ -43,6 +43,12 @@ def test_the_first_frame_needs_no_kernel_that_was_not_rehearsed() -> None:
     subprocess.run([sys.executable, "-m", "tests.edge_unit.test_rehearsal"], check=True, timeout=110)
 
 
+def test_no_reader_of_meshes_is_imported_for_it() -> None:
+    # Half a second, which would be half of a start.
+    code = "import sys; from edge_unit.rehearsal import rehearse; rehearse(); sys.exit('trimesh' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=110)
+
+
 if __name__ == "__main__":
     rehearse()
     ready = compiled()

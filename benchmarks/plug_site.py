@@ -142,15 +142,12 @@ class PlugSite:
         child = await self.processes.start(
             f"unit{number}", "edge_unit", "run", str(config),
             under=socket.under,
-            # What it reports is recorded to be judged; its configuration knows nothing of that.
-            variables={f"{UNIT_PREFIX}TRACE_PATH": str(folder / TRACE)} | self._told(),
+            # What it reports is recorded to be judged; its configuration has nothing of that.
+            variables={f"{UNIT_PREFIX}TRACE_PATH": str(folder / TRACE)},
         )  # fmt: skip
         unit = PluggedUnit(number, folder, socket, source, handling, child, started_ns)
         self.units.append(unit)
         return unit
-
-    def _told(self) -> dict[str, str]:
-        return {f"{UNIT_PREFIX}MASTER_URL": self.url}
 
     def close(self) -> None:
         """Take all networks away; the processes have ended."""

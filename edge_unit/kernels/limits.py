@@ -106,9 +106,9 @@ def band_of_row(
     for i in range(len(nearest_w)):
         w = nearest_w[i]
         z_near = ONE / w
-        z_far = ONE / farthest_w[i]
+        z_far = max(ONE / farthest_w[i], z_near + depth_m)
         near = min(max((z_near - noise_per_m * z_near * z_near) * units_per_m, ZERO), TOP)
-        far = min(max((z_far + noise_per_m * z_far * z_far + depth_m) * units_per_m, ZERO), TOP)
+        far = min(max((z_far + noise_per_m * z_far * z_far) * units_per_m, ZERO), TOP)
         low = np.int32(near)
         # Where nothing was drawn w is 0 and the above is nonsense.
         near_raw[i] = np.uint16(low) if w > ZERO else np.uint16(RAW_MAX)
@@ -131,11 +131,12 @@ def robot_band_raw(
 ) -> None:
     """The band of raw depths in which a measurement belongs to the robot, as `rasterize.draw_meshes` has drawn it.
 
-    From the nearest padded surface less its noise margin to the farthest padded surface plus its margin plus
-    `depth_m`: what stands behind the robot's silhouette is still seen. The band is stored as its lower end
-    and its length, so that the filter needs one unsigned compare. Where there is no robot it is empty: its lower end
-    is where no limit reaches. `columns` (H, 2) holds of each row the first column and the one after the last that the
-    images `near_raw` and `span_raw` (H, W) have a band in; it is renewed, and what was there before is made empty.
+    From the nearest padded surface less its noise margin to the farthest one, links' backs included, or `depth_m`
+    behind the nearest if that is farther, plus the margin there: what stands behind the robot is still seen. The band
+    is stored as its lower end and its length, so that the filter needs one unsigned compare. Where there is no robot
+    it is empty: its lower end is where no limit reaches. `columns` (H, 2) holds of each row the first column and the
+    one after the last that the images `near_raw` and `span_raw` (H, W) have a band in; it is renewed, and what was
+    there before is made empty.
     """
     noise = np.float32(noise_per_m)
     depth = np.float32(depth_m)

@@ -85,8 +85,13 @@ def bodies(cell: Cell, joints: ArrayLike | None) -> list[PlacedMesh]:
     return found
 
 
-def raycast(things: Sequence[PlacedMesh], T_world_camera: Transform, intrinsics: Intrinsics) -> NDArray[np.float64]:
-    """Depth (H, W) in metres along the optical axis by Embree, a ray through each pixel's integer centre; inf: none."""
+def raycast(
+    things: Sequence[PlacedMesh], T_world_camera: Transform, intrinsics: Intrinsics, farthest: bool = False
+) -> NDArray[np.float64]:
+    """Depth (H, W) in metres along the optical axis by Embree, a ray through each pixel's integer centre; inf: none.
+
+    Of the nearest surface, or of the `farthest` that the ray goes through.
+    """
     v, u = np.mgrid[0 : intrinsics.height, 0 : intrinsics.width]
     rays = np.stack(((u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones(u.shape)), -1)
     depth_m = np.full(u.size, np.inf)
@@ -95,9 +100,12 @@ def raycast(things: Sequence[PlacedMesh], T_world_camera: Transform, intrinsics:
         directions = rays.reshape(-1, 3) @ T_world_camera[:3, :3].T
         origins = np.broadcast_to(T_world_camera[:3, 3], directions.shape)
         hits_m, ray, _ = RayMeshIntersector(trimesh.util.concatenate(shapes)).intersects_location(
-            origins, directions, multiple_hits=False
+            origins, directions, multiple_hits=farthest
         )
-        depth_m[ray] = (hits_m - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
+        z_m = (hits_m - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
+        # Ascending, so that of several hits of a ray the last one written is the farthest.
+        order = np.argsort(z_m)
+        depth_m[ray[order]] = z_m[order]
     return depth_m.reshape(intrinsics.shape)
 
 

@@ -23,6 +23,8 @@ from shared.errors import InputError
 from shared.meshes import box_mesh, cylinder_mesh
 from shared.settings import FilterSettings
 from shared.transforms import from_xyz_rpy, look_at
+from simulation.camera import SimulatedCamera, d435i_intrinsics
+from simulation.world import World
 from tests.edge_unit.scenes import (
     ABOVE_TABLE,
     CHECKOUT,
@@ -706,3 +708,14 @@ def test_masks_are_not_shared_with_the_caller() -> None:
     copy = expected_m.copy()
     watched.expected_depth([1.3])
     assert (expected_m == copy).all()
+
+
+def test_links_that_point_at_a_camera_above_them_are_still_robot() -> None:
+    """Beside the near end of such a link the halo of its far end is measured, deep behind the padded surface."""
+    world = World.demo(people=0, seed=1, cell=demo_cell())
+    intrinsics = d435i_intrinsics(848, 480)
+    above = look_at((0.25, 0.25, 1.4), (0.2, 0.1, 0.0))
+    eye = SimulatedCamera(world, above, intrinsics, renderer="raycast", seed=3)
+    pipeline = DepthPipeline(intrinsics, above, demo_cell())
+    frames = [eye.capture(0.69 * n) for n in range(16)]
+    assert [len(pipeline.process(frame.depth, frame.joints)) for frame in frames] == [0] * len(frames)

@@ -120,9 +120,9 @@ def band_twin(
     """Lower and upper end in raw units; both RAW_MAX where no robot is."""
     drawn = nearest_w > 0.0
     near_m = 1.0 / np.where(drawn, nearest_w, 1.0).astype(np.float64)
-    far_m = 1.0 / np.where(drawn, farthest_w, 1.0).astype(np.float64)
+    far_m = np.maximum(1.0 / np.where(drawn, farthest_w, 1.0).astype(np.float64), near_m + depth_m)
     low = np.clip((near_m - noise_per_m * near_m**2) / scale_m, 0, RAW_MAX)
-    high = np.clip((far_m + noise_per_m * far_m**2 + depth_m) / scale_m, 0, RAW_MAX)
+    high = np.clip((far_m + noise_per_m * far_m**2) / scale_m, 0, RAW_MAX)
     return np.where(drawn, low, RAW_MAX), np.where(drawn, high, RAW_MAX)
 
 
@@ -230,4 +230,4 @@ def test_robot_band_of_a_surface_at_the_camera_starts_at_0() -> None:
     columns = np.zeros((1, 2), np.int32)
     robot_band_raw(window, w, w, rectangles, one, 50.0, 0.15, 0.001, near_raw, span_raw, columns)
     assert near_raw[0, 0] == 0
-    assert span_raw[0, 0] == pytest.approx(50 + 125 + 150, abs=1)
+    assert span_raw[0, 0] == pytest.approx(200 + 2000, abs=1)

@@ -34,8 +34,8 @@ LOOK_S = 2.0
 HEAR_S = 1.0
 """From the first master that is heard of to the choice: others answer within a fifth of a second."""
 
-HEAR_FIRST_S = 3.0
-"""... where it is a choice among all cells, and for good."""
+HEAR_FIRST_S = 2.0
+"""... where it is a choice among all cells, and for good: all are asked again after one second, and then after five."""
 
 REACH_S = 1.0
 """For a connection; a master on our own network takes a hundredth of it, a board that is busy ten times that."""

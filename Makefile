@@ -64,6 +64,7 @@ rehearsal: $(READY) ## a master and three units as machines that boot from what 
 
 pictures: $(READY) ## the pictures of the README, painted anew
 	@$(BIN)/python -m simulation.picture assets/pictures/demo.png
+	@$(BIN)/python -m simulation.window_pictures assets/pictures
 
 test: $(READY) libusb lint ## lint, then all tests but the slow ones; with SLOW=1 these too
 	@$(BIN)/python -m pytest -q $(if $(SLOW),,-m "not slow") $(ARGS)

@@ -25,5 +25,6 @@ and tests need no clock. In the order of the flow:
     show         the demo itself
     demo         the command line
     picture      the README's picture
+    window_pictures the README's pictures of the operator's window
     pluggable    RealSense cameras that are plugged in and out: recordings on the SDK's context
 """

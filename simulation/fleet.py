@@ -14,6 +14,7 @@ from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
+import httpx
 import yaml
 
 from edge_unit.config import ENVIRONMENT_PREFIX as UNIT_PREFIX
@@ -105,10 +106,13 @@ class Fleet:
         self._ready: dict[str, Any] = json.loads(ready_file.read_bytes())
         self.url = self._ready["url"]
 
-    @property
-    def operator_token(self) -> str:
-        """Of the master."""
-        return Path(self._ready["operator_token_file"]).read_text().strip()
+    async def viewer_link(self) -> str | None:
+        """A link into the master's viewer, as its operator; None where none is installed."""
+        token = Path(self._ready["operator_token_file"]).read_text().strip()
+        headers = {"Authorization": f"Bearer {token}"}
+        async with httpx.AsyncClient(base_url=self.url, headers=headers, trust_env=False) as client:
+            answer = await client.post("/viewer/links")
+        return f"{self.url}{answer.json()['path']}" if answer.is_success else None
 
     async def switch_power(self, verb: str, address: str) -> str | None:
         """`cut` a unit's power, or `give` it again; returns why not, or None."""

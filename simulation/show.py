@@ -127,7 +127,7 @@ async def _start(fleet: Fleet, screen: Screen, power: PowerSwitch, may_open: boo
     """Start the fleet; the first thing that is said is where to find it, the second where to see it."""
     await fleet.start_master(power.actions)
     screen.say(f"Cellwatch demo: {fleet.url} (try: curl {fleet.url}/voxels; Ctrl-C stops)")
-    if link := await _link(fleet):
+    if link := await fleet.viewer_link():
         screen.say(f"watch it in a browser: {link} (works once)")
         if may_open and any(os.environ.get(name) for name in DISPLAYS):
             await asyncio.to_thread(webbrowser.open, link)
@@ -140,14 +140,6 @@ async def _start(fleet: Fleet, screen: Screen, power: PowerSwitch, may_open: boo
     finally:
         warm_up.cancel()
     await fleet.start_units()
-
-
-async def _link(fleet: Fleet) -> str | None:
-    """A link into the master's viewer, as its operator; None where none is installed."""
-    headers = {"Authorization": f"Bearer {fleet.operator_token}"}
-    async with httpx.AsyncClient(base_url=fleet.url, headers=headers, trust_env=False) as client:
-        answer = await client.post("/viewer/links")
-    return f"{fleet.url}{answer.json()['path']}" if answer.is_success else None
 
 
 async def _watch(fleet: Fleet, seconds: float | None, screen: Screen, outcome: Outcome) -> None:

@@ -48,7 +48,7 @@ BOX_EDGES = np.array(
 QUAD = np.array([(0, 1, 2), (0, 2, 3)], np.uint32)
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
 
-VIEW_FROM = np.array([0.75, -1.0, 0.6])
+VIEW_FROM = np.array([0.98, 0.6, 0.66])
 """In diagonals of the box, from its middle."""
 
 VIEW_FOV_RAD = 0.8

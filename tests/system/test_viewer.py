@@ -128,7 +128,7 @@ def is_obstacle(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
 def count_of(picture: NDArray[np.uint8], state: str, place: NDArray[np.int64]) -> int:
     """Pixels around a place (x, y) in the colour of a state."""
     (x, y), reach = place, 90
-    around = picture[max(y - reach, 0) : y + reach, max(x - reach, 0) : min(x + reach, 800)]
+    around = picture[max(y - reach, 0) : y + reach, max(x - reach, 0) : min(x + reach, 885)]
     return int((np.abs(around.astype(int) - STATE_COLOURS[state]).max(axis=2) < 40).sum())
 
 

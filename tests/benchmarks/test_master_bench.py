@@ -117,7 +117,8 @@ async def test_a_stall_counts_for_all_that_would_have_come_meanwhile(tmp_path: P
 
 async def test_without_a_rate_the_next_follows_the_answer(tmp_path: Path) -> None:
     found = await counts(tmp_path, lambda n, _: 0.02, units=4, rate_hz=None)
-    assert 4 * 20 < found["counted"] <= 4 * 50
+    # Fifty a second each where nothing else runs; on a busy machine fewer, but never more.
+    assert 4 * 3 < found["counted"] <= 4 * 50
 
 
 async def test_the_bytes_are_those_of_the_units_own_client() -> None:

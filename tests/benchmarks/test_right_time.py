@@ -16,6 +16,7 @@ from simulation.camera import d435i_intrinsics
 FRAMES = 16
 
 
+@pytest.mark.slow
 def test_late_joints_are_met_and_an_untold_delay_is_not() -> None:
     cases = [(deliveries()[0], 0.0), (deliveries()[1], 0.0), (UNTOLD, 0.0)]
     exact, stamped, told, untold = watch("reversals", cases, FRAMES, d435i_intrinsics(424, 240), Settings())

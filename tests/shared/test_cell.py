@@ -105,11 +105,15 @@ def test_demo_gripper_is_12_cm_long_and_points_out_of_the_flange(demo: Cell) -> 
 def test_demo_board_lies_on_the_table_printed_side_up(demo: Cell) -> None:
     assert demo.board is not None
     board = demo.board
-    assert (board.kind, board.columns, board.rows, board.dictionary) == ("grid", 4, 3, "DICT_4X4_50")
+    assert (board.kind, board.columns, board.rows, board.dictionary) == ("grid", 8, 6, "DICT_4X4_50")
     gap_m = board.square_m - board.marker_m
     far = (board.columns * board.square_m - gap_m, board.rows * board.square_m - gap_m, 0.0)
     corners = apply(board.T_world_board, np.array([(0.0, 0.0, 0.0), far]))
-    np.testing.assert_allclose(corners, [[0.22, 0.13, 0.0], [0.91, -0.38, 0.0]], atol=1e-9)
+    np.testing.assert_allclose(corners[:, 2], 0.0, atol=1e-9)
+    table = next(each for each in demo.static if each.name == "table")
+    top_m = apply(table.T_world_mesh, table.mesh.vertices)[:, :2]
+    assert (corners[:, :2] > top_m.min(axis=0)).all()
+    assert (corners[:, :2] < top_m.max(axis=0)).all()
     np.testing.assert_allclose(board.T_world_board[:3, 2], [0.0, 0.0, -1.0], atol=1e-12)
 
 

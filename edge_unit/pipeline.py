@@ -167,7 +167,7 @@ class DepthPipeline:
 
     def misfit(self) -> Misfit:
         """How badly the last frame fits what is known, from here and from places close by."""
-        return self._misfit.check(self._depth_raw, self._static_raw, self._robot.near_raw, self.settings)
+        return self._misfit.check(self._depth_raw, self._standing_raw, self._robot.near_raw, self.settings)
 
     # ------------------------------------------------------------------ learning the empty cell
 
@@ -233,7 +233,7 @@ class DepthPipeline:
 
     def refiner(self) -> Refiner:
         """Finds a better pose by the CAD, from frames of `without_robot`; `move` makes it count."""
-        return Refiner(self.intrinsics, self.T_world_camera, self._cad_depth_m(), self._noise_per_m)
+        return Refiner(self.intrinsics, self.T_world_camera, _depth_m(self._cad_w()), self._noise_per_m)
 
     # ------------------------------------------------------------------ what may change while it runs
 
@@ -392,9 +392,10 @@ class DepthPipeline:
         np.subtract(np.maximum(self._limit_raw, self._minimum_raw), self._minimum_raw, out=self._room_raw)
         self._halo.renew(w, settings.static_padding_m, settings.margin_base_m, cad_noise_per_m)
         self._halo.lower(self._limit_raw, self._seen_limit_raw)
-        self._static_depth_m = np.fmin(self._cad_depth_m(), reference_m)
-        static_raw = np.nan_to_num(self._static_depth_m / camera.depth_scale_m, nan=0.0, posinf=0.0)
-        self._static_raw = np.where(static_raw < limits.RAW_MAX, static_raw, 0.0).astype(np.uint16)
+        self._static_depth_m = np.fmin(_depth_m(w), reference_m)
+        self._static_raw = self._raw(self._static_depth_m)
+        # Known objects may be carried away before anyone tells; that is no reason to doubt where the camera stands.
+        self._standing_raw = self._raw(np.fmin(_depth_m(self._static.nearest_w), reference_m))
         self.static_version += 1
 
     def _voxelizer_of(self, cell: Cell, settings: FilterSettings) -> Voxelizer:
@@ -414,12 +415,10 @@ class DepthPipeline:
         """Inverse depth (H, W) of CAD and known objects in 1/m, 0 where there are none."""
         return np.asarray(np.maximum(self._static.nearest_w, self._objects.nearest_w))
 
-    def _cad_depth_m(self) -> NDArray[np.float32]:
-        """Depth (H, W) of CAD and known objects in metres, inf where there are none."""
-        w = self._cad_w()
-        depth_m = np.full(w.shape, np.inf, np.float32)
-        np.divide(1.0, w, out=depth_m, where=w > 0.0)
-        return depth_m
+    def _raw(self, depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+        """Depth (H, W) in raw units, 0 where nothing is known or it is too far for 16 bits."""
+        raw = np.nan_to_num(depth_m / self.intrinsics.depth_scale_m, nan=0.0, posinf=0.0)
+        return np.where(raw < limits.RAW_MAX, raw, 0.0).astype(np.uint16)
 
     def _check_uncertainty(self, joint_uncertainty_rad: ArrayLike) -> NDArray[np.float64] | None:
         """The uncertainty (n,) of each joint; None when there is none."""
@@ -447,6 +446,13 @@ class DepthPipeline:
 
 def _same_box(one: Cell, other: Cell) -> bool:
     return np.array_equal(one.box_min_m, other.box_min_m) and np.array_equal(one.box_max_m, other.box_max_m)
+
+
+def _depth_m(w_per_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Depth (H, W) in metres of inverse depth, inf where that is 0."""
+    depth_m = np.full(w_per_m.shape, np.inf, np.float32)
+    np.divide(1.0, w_per_m, out=depth_m, where=w_per_m > 0.0)
+    return depth_m
 
 
 def _of_type(value: Kind, kind: type, name: str) -> Kind:

@@ -103,6 +103,15 @@ def test_a_changed_cell_changes_no_verdict_by_itself(watched: Watched) -> None:
     assert watched.last(WINDOW, KNOCKS["1 degree"]).moved
 
 
+def test_a_known_object_that_was_carried_away_is_no_doubt_about_the_camera(watched: Watched) -> None:
+    cell = demo_cell()
+    assert cell.objects
+    there = from_xyz_rpy((0.2, 0.3, 0.0), (0.0, 0.0, 0.5))
+    elsewhere = replace(cell, objects=tuple(replace(each, T_world_mesh=there) for each in cell.objects))
+    watched.pipeline.adopt(elsewhere, watched.pipeline.settings)
+    assert set(watched.looks(BASELINE_LOOKS)) == {Verdict()}
+
+
 def test_a_pose_that_was_wrong_from_the_beginning_is_a_warning(tmp_path: Path) -> None:
     watched = Watched(tmp_path)
     off = from_xyz_rpy((0, 0, 0), np.radians((0.9, 0.0, 0.0)))

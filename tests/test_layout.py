@@ -159,7 +159,7 @@ BAD = {
     "edge_unit/loose/part.py": "",
     "simulation/__init__.py": '"""Simulation."""',
     "simulation/world.py": "import edge_unit.pipeline",
-    "notes.md": "fine: ~/x, $HOME/x, a/root/b\nlies in /" + "home/anna/x\nfrom py" + "pi.org",
+    "notes.md": "fine: ~/x, $HOME/x, a/ro" + "ot/b\nlies in /" + "home/anna/x\nfrom py" + "pi.org",
 }
 EXPECTED: dict[Check, list[str]] = {
     check_listings: [

@@ -3,7 +3,8 @@
 
 In the order of the flow:
 
-    report     tables for people, marks, and one line of JSON for machines
+    circumstances when, on what machine and of which state of the source a figure was taken
+    report     tables and curves for people, marks, and one line of JSON for machines
     stage      one camera before one thing: a bare scene whose every pixel is a ray cast by Embree
     thickness  how thin a thing on a table may be before it is lost
     shapes     plates and rods that must never be lost, speckle that must be

@@ -1,26 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables for people, marks, and one line of JSON for machines."""
+"""Tables and curves for people, marks, and one line of JSON for machines."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+from benchmarks.circumstances import circumstances
 
 RESULTS = Path(__file__).resolve().parent / "results"
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A figure that must not be above (`at_most`) or below (`at_least`) a limit."""
+    """A figure that must not be above (`at_most`) or below (`at_least`) a limit; `why` is what is known when it is."""
 
     name: str
     value: float
     at_most: float | None = None
     at_least: float | None = None
+    why: str | None = None
 
     @property
     def met(self) -> bool:
@@ -29,8 +32,11 @@ class Mark:
         return below and (self.at_least is None or self.value >= self.at_least)
 
     def document(self) -> dict[str, Any]:
-        """As plain values, without the bound that it does not have."""
-        return {key: _plain(value) for key, value in asdict(self).items() if value is not None} | {"met": self.met}
+        """As plain values, without the bound that it does not have, and without excuse where it needs none."""
+        given = {key: _plain(value) for key, value in asdict(self).items() if value is not None}
+        if self.met:
+            given.pop("why", None)
+        return given | {"met": self.met}
 
     def __str__(self) -> str:
         bound = f"at most {self.at_most:g}" if self.at_most is not None else f"at least {self.at_least:g}"
@@ -61,6 +67,26 @@ class Result:
         return "\n".join(lines)
 
 
+@dataclass(frozen=True)
+class Curves:
+    """What one picture shows: lines over one axis, by name; labels of axes carry their units."""
+
+    title: str
+    x_label: str
+    y_label: str
+    series: Mapping[str, Sequence[tuple[float, float]]]
+    logarithmic: str = ""
+    """Axes with equal steps for equal ratios: "", "x", "y" or "xy"."""
+
+    def document(self) -> dict[str, Any]:
+        """As plain values; what was not measured has no point."""
+        lines = {
+            name: [[_plain(x), _plain(y)] for x, y in points if not math.isnan(y)]
+            for name, points in self.series.items()
+        }
+        return asdict(self) | {"series": lines}
+
+
 def table(columns: Sequence[str], rows: Iterable[Sequence[str | float]]) -> list[str]:
     """Lines of a table with the columns' names on top; numbers stand to the right."""
     cells = [list(columns)] + [[_text(value) for value in row] for row in rows]
@@ -78,9 +104,10 @@ def line(document: dict[str, Any]) -> str:
 
 
 def write(name: str, document: dict[str, Any], folder: Path = RESULTS) -> None:
-    """Leave `document` in `folder`/`name`.json."""
+    """Leave `document` in `folder`/`name`.json, with the circumstances under which it was `taken`."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{name}.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
+    kept = document | {"taken": circumstances()}
+    (folder / f"{name}.json").write_text(json.dumps(kept, indent=1, allow_nan=False) + "\n")
 
 
 def _plain(value: str | float) -> str | float | None:

@@ -4,6 +4,7 @@
 In the order of the flow:
 
     common    bodies in bounds, JSON or msgpack, tokens
+    sockets   a WebSocket served until one side goes
     update    `POST /update`, the path that every frame of every unit takes
     units     registering, and what is known of each unit
     images    a unit's pictures, on request

@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from contextlib import suppress
 from typing import Literal
 
-from fastapi import APIRouter, WebSocket, WebSocketDisconnect
-from fastapi.websockets import WebSocketState
+from fastapi import APIRouter, WebSocket
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from master_server.access import ANYONE
 from master_server.answers import Form
 from master_server.routes.common import access_of, ip_of, log_refusal, refused, role_of
+from master_server.routes.sockets import serve
 from master_server.stream import Listener, Stream, Wish
 from shared.configuration import sentence
 from shared.errors import Refusal
@@ -31,9 +30,6 @@ SUBPROTOCOL = "cellwatch"
 """What the master agrees to: a browser wants one of those that it offered, and the token must not come back."""
 
 BEARER = "bearer."
-
-TOKEN_REPLACED = 1008
-"""What a stream is closed with whose token holds no more: a policy, says RFC 6455."""
 
 
 class StreamQuery(BaseModel):
@@ -67,23 +63,11 @@ async def stream(websocket: WebSocket) -> None:
     with listener:
         await websocket.accept(SUBPROTOCOL if SUBPROTOCOL in websocket.scope["subprotocols"] else None)
         logger.info("reader %s listens (%d in all)", fields["ip"], len(source), extra=fields)
-        works = (_send(websocket, listener), _until_gone(websocket), token_ended.wait())
-        tasks: list[asyncio.Task[object]] = [asyncio.ensure_future(work) for work in works]
         try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            await serve(websocket, token_ended, _send(websocket, listener), _until_gone(websocket))
         finally:
-            for task in tasks:
-                task.cancel()
-            ended = await asyncio.gather(*tasks, return_exceptions=True)
-    if token_ended.is_set() and websocket.application_state is WebSocketState.CONNECTED:
-        with suppress(WebSocketDisconnect):
-            await websocket.close(TOKEN_REPLACED, "the token was replaced")
-    logger.info(
-        "reader %s is gone: %d messages sent, %d skipped", fields["ip"], listener.sent, listener.skipped, extra=fields
-    )
-    for outcome in ended:
-        if isinstance(outcome, Exception) and not isinstance(outcome, WebSocketDisconnect):
-            raise outcome
+            sent, skipped = listener.sent, listener.skipped
+            logger.info("reader %s is gone: %d messages sent, %d skipped", fields["ip"], sent, skipped, extra=fields)
 
 
 async def _send(websocket: WebSocket, listener: Listener) -> None:

@@ -12,15 +12,13 @@ import base64
 import gzip
 import hashlib
 import logging
-from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import msgpack
-from fastapi import APIRouter, Request, Response, WebSocket, WebSocketDisconnect
-from fastapi.websockets import WebSocketState
+from fastapi import APIRouter, Request, Response, WebSocket
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import HTTPConnection
 from starlette.responses import RedirectResponse
@@ -37,7 +35,7 @@ from master_server.routes.common import (
     refused,
     role_of,
 )
-from master_server.routes.stream import TOKEN_REPLACED
+from master_server.routes.sockets import serve
 from master_server.tokens import TOKEN_MAX_CHARS
 from master_server.viewer.host import ViewerHost
 from master_server.viewer.sessions import SESSION_S, SIGNED_WITH, Sessions, Viewer, viewer_of
@@ -289,20 +287,8 @@ async def _pass_on(websocket: WebSocket, host: ViewerHost, viewer: Viewer, token
         proxy=None,
     ) as inner:
         await websocket.accept(inner.subprotocol)
-        works = (_up(websocket, inner), _down(websocket, inner), token_ended.wait())
-        tasks: list[asyncio.Task[object]] = [asyncio.ensure_future(work) for work in works]
-        try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for task in tasks:
-                task.cancel()
-            ended = await asyncio.gather(*tasks, return_exceptions=True)
-    if token_ended.is_set() and websocket.application_state is WebSocketState.CONNECTED:
-        with suppress(WebSocketDisconnect):
-            await websocket.close(TOKEN_REPLACED, "the token was replaced")
-    for outcome in ended:
-        if isinstance(outcome, Exception) and not isinstance(outcome, (WebSocketDisconnect, ConnectionClosed)):
-            raise outcome
+        both_ways = _up(websocket, inner), _down(websocket, inner)
+        await serve(websocket, token_ended, *both_ways, gone=(ConnectionClosed,))
 
 
 async def _up(websocket: WebSocket, inner: ClientConnection) -> None:

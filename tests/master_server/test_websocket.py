@@ -21,7 +21,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from master_server.access import Access
 from master_server.app import Application, add_viewer, make_app
 from master_server.master import Master
-from master_server.routes.stream import TOKEN_REPLACED
+from master_server.routes.sockets import TOKEN_REPLACED
 from master_server.stream import MAX_LISTENERS, Stream
 from master_server.tokens import Role
 from master_server.websocket import CLOSE_S, MESSAGE_MAX_BYTES, SERVER_OPTIONS

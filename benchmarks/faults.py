@@ -19,6 +19,7 @@ import tempfile
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -378,44 +379,43 @@ async def unit_disk_full(site: Site, course: Course) -> None:
 
 async def units_swapped(site: Site, course: Course) -> None:
     """Both units are started again with each other's address; then an operator tells where the cameras are."""
-    await ordinary(site)
-    begin(course)
-    for unit in site.units:
-        await site.kill(unit)
-    site.newcomer()
-    site.addresses.reverse()
-    for index in (FIRST, SECOND):
-        await site.start_unit(index)
-    for index in (FIRST, SECOND):
-        await until(lambda index=index: registered(site.units[index]), "the swapped units register")  # type: ignore[misc]
+    await swap_addresses(site, course)
+    for unit in [await site.start_unit(index) for index in (FIRST, SECOND)]:
+        await until(partial(registered, unit), "the swapped units register")
     await hold()
     course.gone_ns = monotonic_ns()
-    await site.give_poses()
-    before = await site.acknowledged()
-    for serial in SERIALS:
-        site.expect(serial, before[serial])
-    await site.settled()
+    await tell_poses(site)
 
 
 async def address_taken(site: Site, course: Course) -> None:
     """The first unit comes back with the address of the second, which is gone for now; an operator tells its pose."""
+    await swap_addresses(site, course)
+    unit = await site.start_unit(FIRST)
+    await until(partial(registered, unit), "the unit registers with the other's address")
+    await site.give_poses()
+    await hold()
+    unit = await site.start_unit(SECOND)
+    await until(partial(registered, unit), "the other unit registers")
+    course.gone_ns = monotonic_ns()
+    await tell_poses(site)
+
+
+async def swap_addresses(site: Site, course: Course) -> None:
+    """Both units are killed; whichever is started again has the other's address."""
     await ordinary(site)
     begin(course)
     for unit in site.units:
         await site.kill(unit)
     site.newcomer()
     site.addresses.reverse()
-    await site.start_unit(FIRST)
-    await until(lambda: registered(site.units[FIRST]), "the unit registers with the other's address")
+
+
+async def tell_poses(site: Site) -> None:
+    """An operator tells where the cameras are, which the master is to keep from now on."""
     await site.give_poses()
-    await hold()
-    unit = await site.start_unit(SECOND)
-    await until(lambda: registered(unit), "the other unit registers")
-    course.gone_ns = monotonic_ns()
-    await site.give_poses()
-    now = await site.acknowledged()
+    acknowledged = await site.acknowledged()
     for serial in SERIALS:
-        site.expect(serial, now[serial])
+        site.expect(serial, acknowledged[serial])
     await site.settled()
 
 

@@ -38,6 +38,7 @@ In the order of the flow:
     master_search   looks for the master while it does not answer
     client          what a unit can ask the master
     cell_cache      the master's cell, kept on disk
+    stages          how long a frame spent in each stage of the unit
     uplink          the exchange with the master: latest wins
     background      the learned reference, kept on disk
     stance          does the camera still stand where its pose was found

@@ -3,15 +3,16 @@
 
 A file of msgpack maps, one after the other: `frame_number, captured_at_ns` (the unit's clock), `process_ms`, `keys`
 (ascending little-endian uint32), `shape` and `voxel_size_m` of their lattice, `sent` (false: a newer frame took its
-place before it was sent), and of those that were sent `merged_at_ns`, when the master had merged it, by the unit's
-clock.
+place before it was sent), and of those that were sent `sent_at_ns`, `received_at_ns` (the master had all of it) and
+`merged_at_ns` (it had merged it), by the unit's clock. `stages_ns` are the nanoseconds that the frame spent in each
+stage from its capture on; empty of one that did not go through all of them.
 """
 
 from __future__ import annotations
 
 import logging
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,9 @@ class TraceRecord:
     voxel_size_m: float
     sent: bool
     merged_at_ns: int | None
+    sent_at_ns: int | None = None
+    received_at_ns: int | None = None
+    stages_ns: dict[str, int] = field(default_factory=dict)
 
 
 class Trace:

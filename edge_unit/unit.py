@@ -42,9 +42,10 @@ from edge_unit.sources.realsense import RealsenseSource, RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
 from edge_unit.sources.simulated import SimulatedSource
 from edge_unit.sources.status import ReportsStatus
+from edge_unit.stages import Stages
 from edge_unit.stance import Stance, Verdict, place_of
 from edge_unit.trace import Trace, TraceRecord
-from edge_unit.uplink import Assignment, Report, Uplink
+from edge_unit.uplink import Assignment, Delivery, Report, Uplink
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, InputError, SourceError
 from shared.messages import DONE, MAX_TEXT, MAX_VOXELS, Command, Health, ImageKind, PoseQuality, ToldOrigin
@@ -296,10 +297,13 @@ class Unit:
             if self._localises(assignment) and self._search.due(monotonic_ns()):
                 await self._localise(assignment, frame)
             return
+        stages = Stages(frame.captured_at_ns)
+        stages.end("source")
         joints = await self._joints_at(assignment, frame)
+        stages.end("joints")
         pose = assignment.T_world_camera
         with self._progress.working(f"frame {frame.frame_number}", self._limit_s(assignment, commands)):
-            report = await asyncio.to_thread(self._process, assignment, pose, frame, joints, commands)
+            report = await asyncio.to_thread(self._process, assignment, pose, frame, joints, commands, stages)
         self._taken += 1
         if (report.health.trouble is None) != (self._trouble is None):
             logger.info("%s", report.health.trouble or "frames are filtered and reported")
@@ -451,6 +455,7 @@ class Unit:
         frame: DepthFrame,
         joints: JointEstimate | None,
         commands: list[Command],
+        stages: Stages,
     ) -> Report:
         """Everything about a frame that takes time."""
         if self._trace is not None:
@@ -466,8 +471,8 @@ class Unit:
             for command in commands:
                 self._obey(command, pipeline)
             if self._learning is not None:
-                return self._learn(self._learning, pipeline, assignment, frame, joints)
-            return self._report(pipeline, assignment, frame, joints)
+                return self._learn(self._learning, pipeline, assignment, frame, joints, stages)
+            return self._report(pipeline, assignment, frame, joints, stages)
         except InputError as error:
             logger.warning("frame %d: %s", frame.frame_number, error)
             return _troubled(assignment, frame, str(error))
@@ -544,6 +549,7 @@ class Unit:
         assignment: Assignment,
         frame: DepthFrame,
         joints: JointEstimate | None,
+        stages: Stages,
     ) -> Report:
         """Add a frame to the background; nothing is reported meanwhile."""
         if assignment.cell.robot is not None and joints is None:
@@ -557,16 +563,25 @@ class Unit:
         self._store.save(self._place(pipeline), reference)
         self._end_learning(DONE)
         logger.info("learned the background from %d frames: %.0f %% of it", done, 100.0 * reference.learned_share)
-        return self._report(pipeline, assignment, frame, joints)
+        return self._report(pipeline, assignment, frame, joints, stages)
 
     def _report(
-        self, pipeline: DepthPipeline, assignment: Assignment, frame: DepthFrame, joints: JointEstimate | None
+        self,
+        pipeline: DepthPipeline,
+        assignment: Assignment,
+        frame: DepthFrame,
+        joints: JointEstimate | None,
+        stages: Stages,
     ) -> Report:
         """What a frame shows, and whether its camera can be trusted."""
+        stages.end("thread")
         if joints is None:
             voxels = pipeline.process(frame.depth, None)
         else:
             voxels = pipeline.process(frame.depth, joints.positions, joint_uncertainty_rad=joints.uncertainty)
+        took = pipeline.last
+        parts_ns = {"robot": took.expected_ns, "filter": took.points_ns, "density": took.voxels_ns}
+        stages.end("check", parts_ns)
         seen, crowd = pipeline.seen(), None
         if len(voxels) > MAX_VOXELS:
             crowd = f"{len(voxels)} obstacle voxels: the {MAX_VOXELS} nearest are reported, the rest counts as not seen"
@@ -574,10 +589,12 @@ class Unit:
             seen = seen.without(beyond)
         health, stance = pipeline.health(), self._judge(pipeline, frame)
         self._gather(pipeline, frame, joints)
+        keys = keys_to_bytes(voxels.keys)
+        stages.end("report")
         return Report(
             assignment,
             frame.captured_at_ns,
-            keys_to_bytes(voxels.keys),
+            keys,
             seen,
             Health(
                 valid_share=health.valid_share,
@@ -590,6 +607,7 @@ class Unit:
                 blind=stance.blind or None,
                 warning=stance.warning or self._delay.warning(assignment.settings.joint_delay_s) or crowd,
             ),
+            stages.took_ns,
         )
 
     def _gather(self, pipeline: DepthPipeline, frame: DepthFrame, joints: JointEstimate | None) -> None:
@@ -618,7 +636,7 @@ class Unit:
 
     # ------------------------------------------------------------------ the trace
 
-    def _note(self, report: Report, merged_at_ns: int | None) -> None:
+    def _note(self, report: Report, delivery: Delivery | None) -> None:
         """Remember what became of a report."""
         if self._trace is None or report.captured_at_ns is None:
             return
@@ -631,8 +649,11 @@ class Unit:
                 report.keys,
                 lattice.shape,
                 lattice.voxel_size_m,
-                merged_at_ns is not None,
-                merged_at_ns,
+                delivery is not None,
+                None if delivery is None else delivery.merged_at_ns,
+                None if delivery is None else delivery.sent_at_ns,
+                None if delivery is None else delivery.received_at_ns,
+                report.stages_ns,
             )
         )
 

@@ -23,6 +23,7 @@ import logging
 import random
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from edge_unit.cell_cache import CellCache
 from edge_unit.client import MasterClient
@@ -92,13 +93,25 @@ class Assignment:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """One frame's result, and the assignment that it was made with. `seen` is None when nothing is known to be seen."""
+    """One frame's result, and the assignment that it was made with. `seen` is None when nothing is known to be seen.
+
+    `stages_ns` is how long the frame spent in each stage, of one that went through all of them.
+    """
 
     assignment: Assignment
     captured_at_ns: int | None = None
     keys: bytes = b""
     seen: SeenBlocks | None = None
     health: Health = field(default_factory=Health)
+    stages_ns: dict[str, int] = field(default_factory=dict)
+
+
+class Delivery(NamedTuple):
+    """When a report was sent, when the master had all of it, and when it had merged it: by the unit's clock, in ns."""
+
+    sent_at_ns: int
+    received_at_ns: int
+    merged_at_ns: int
 
 
 class Uplink:
@@ -110,10 +123,10 @@ class Uplink:
         cells: CellCache,
         software: str,
         boot_id: str,
-        on_sent: Callable[[Report, int | None], None],
+        on_sent: Callable[[Report, Delivery | None], None],
         search: MasterSearch | None = None,
     ) -> None:
-        """`on_sent` is told of each report: when the master had merged it, by the unit's clock; None: it never was.
+        """`on_sent` is told of each report how it reached the master; None: it never did.
 
         `search` tells where the master is; without, it is where the client was aimed at, for ever.
         """
@@ -342,7 +355,7 @@ class Uplink:
             report = Report(assignment, health=Health(trouble=self.trouble))
         self._last = report
         try:
-            answer, merged_at_ns = await self._exchange_update(assignment, report)
+            answer, delivery = await self._exchange_update(assignment, report)
         except CellwatchError:
             self._put_back(fresh)
             raise
@@ -350,7 +363,7 @@ class Uplink:
             if self._fresh is None:
                 self._idle.set()
         if fresh is not None:
-            self._on_sent(fresh, merged_at_ns)
+            self._on_sent(fresh, delivery)
         await self._follow(assignment, answer)
 
     def _put_back(self, report: Report | None) -> None:
@@ -360,7 +373,7 @@ class Uplink:
         elif report is not None:
             self._on_sent(report, None)
 
-    async def _exchange_update(self, assignment: Assignment, report: Report) -> tuple[UpdateAnswer, int]:
+    async def _exchange_update(self, assignment: Assignment, report: Report) -> tuple[UpdateAnswer, Delivery]:
         self._sequence += 1
         versions = report.assignment.versions
         seen_bits = report.seen.packed() if report.seen is not None else b""
@@ -399,7 +412,8 @@ class Uplink:
         if report.seen is not None:
             self._acknowledged = versions, seen_bits
         self._forget_commands(done)
-        return answer, answer.answered_at_ns - self.clock.offset_ns
+        offset_ns = self.clock.offset_ns
+        return answer, Delivery(sent_at_ns, answer.received_at_ns - offset_ns, answer.answered_at_ns - offset_ns)
 
     async def _follow(self, assignment: Assignment, answer: UpdateAnswer) -> None:
         """Do what the master's answer asks for."""

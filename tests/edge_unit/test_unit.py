@@ -355,9 +355,9 @@ async def test_joints_of_the_frames_time_reach_the_pipeline(tmp_path: Path, monk
     used: list[Any] = []
     report = unit_module.Unit._report
 
-    def spy(unit: Any, pipeline: Any, assignment: Any, frame: Any, joints: Any) -> Any:
+    def spy(unit: Any, pipeline: Any, assignment: Any, frame: Any, joints: Any, stages: Any) -> Any:
         used.append(joints)
-        return report(unit, pipeline, assignment, frame, joints)
+        return report(unit, pipeline, assignment, frame, joints, stages)
 
     monkeypatch.setattr(unit_module.Unit, "_report", spy)
     async with bench.running():
@@ -387,9 +387,9 @@ async def test_joints_whose_times_are_late_are_looked_up_later(tmp_path: Path, m
     def turned(at_ns: int) -> float:
         return (at_ns - began_ns) / NS_PER_S
 
-    def spy(unit: Any, pipeline: Any, assignment: Any, frame: Any, joints: Any) -> Any:
+    def spy(unit: Any, pipeline: Any, assignment: Any, frame: Any, joints: Any, stages: Any) -> Any:
         ahead_s.append(None if joints is None else joints.positions[1] - turned(frame.captured_at_ns))
-        return report(unit, pipeline, assignment, frame, joints)
+        return report(unit, pipeline, assignment, frame, joints, stages)
 
     def has_more_than(count: int) -> bool:
         return len(ahead_s) > count
@@ -591,6 +591,11 @@ async def test_at_the_end_of_a_recording_the_last_frame_is_merged(tmp_path: Path
     assert last.sent
     assert last.merged_at_ns is not None
     assert 0 < last.merged_at_ns - last.captured_at_ns < 10**10
+    stages = ["source", "joints", "thread", "robot", "filter", "density", "check", "report"]
+    assert list(last.stages_ns) == stages
+    assert all(took_ns >= 0 for took_ns in last.stages_ns.values())
+    assert last.sent_at_ns is not None
+    assert last.captured_at_ns + sum(last.stages_ns.values()) <= last.sent_at_ns
     assert len(last.keys) // 4 == len(bench.voxels())
     assert last.shape == (20, 40, 10)
 

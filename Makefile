@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench-pipeline bench-board bench-master bench-stance viewer-test rehearsal pictures test lint clean libusb
+.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench-pipeline bench-board bench-master bench-scale bench-stance viewer-test rehearsal pictures test lint clean libusb
 
 ARGS ?=
 EXTRAS := edge,master,realsense,sim,dev
@@ -49,6 +49,9 @@ bench-pipeline: $(BENCH_READY) libusb ## what a frame costs, beside Open3D, Octo
 
 bench-master: $(READY) ## how many units one master bears, beside a bare route of FastAPI
 	@$(BIN)/python -m benchmarks.master $(ARGS)
+
+bench-scale: $(READY) ## one master and more and more units, until it bends
+	@$(BIN)/python -m benchmarks.scale $(ARGS)
 
 bench-board: $(READY) ## how well a camera's pose is found by a calibration board, by distance
 	@$(BIN)/python -m benchmarks.board $(ARGS)

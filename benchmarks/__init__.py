@@ -35,8 +35,13 @@ In the order of the flow:
     traffic      what units send, in the very bytes of their client
     load         a process that sends it for many units, and counts
     bare_fastapi what a master is measured against
+    map_readers  two robots that read the map, and when they had it
     watchers     people who look at the master's viewer
     master       what one master bears
+    merge_costs  what the merge itself costs, by the number of units
+    wide_master  a master that takes more units than it should
+    scale_load   more and more units before one master
+    scale        one master and more and more units, until it bends
     viewer       the operator's window in a real browser, and what those who look cost the units
     machines     machines that boot systemd from one read-only root file system
     rehearsal    three units and a master as such machines: switched on, failing, coming back

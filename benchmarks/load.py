@@ -265,21 +265,30 @@ async def registered(plan: Plan, token: str) -> list[SimpleUnit]:
     for number in range(plan.units):
         unit = SimpleUnit(str(FIRST_ADDRESS + number), views[number % VIEWS], 11 * number, head)
         units.append(unit)
-        if plan.bare:
-            continue
-        async with MasterClient(plan.url, lambda: token, unit.address) as client:
-            answer = await client.initialize(
-                InitializeRequest(
-                    contract=CONTRACT_VERSION,
-                    serial=f"load-{number}",
-                    intrinsics=Intrinsics(848, 480, 430.0, 430.0, 424.0, 240.0),
-                    sent_at_ns=monotonic_ns(),
-                )
-            )
-            pose = await client.put_pose(answer.id, np.eye(4), "configured")
-        unit.id, unit.session = answer.id, answer.session
-        unit.versions = answer.versions.model_copy(update={"pose": pose})
+        if not plan.bare:
+            await register(unit, plan.url, token)
     return units
+
+
+async def register(unit: SimpleUnit, url: str, token: str) -> None:
+    """Make a unit known to the master, with a pose of its camera.
+
+    Raises:
+        MasterRefused: it is one too many.
+        UplinkError: the master does not answer.
+    """
+    async with MasterClient(url, lambda: token, unit.address) as client:
+        answer = await client.initialize(
+            InitializeRequest(
+                contract=CONTRACT_VERSION,
+                serial=f"load-{unit.address}",
+                intrinsics=Intrinsics(848, 480, 430.0, 430.0, 424.0, 240.0),
+                sent_at_ns=monotonic_ns(),
+            )
+        )
+        pose = await client.put_pose(answer.id, np.eye(4), "configured")
+    unit.id, unit.session = answer.id, answer.session
+    unit.versions = answer.versions.model_copy(update={"pose": pose})
 
 
 def map_is_right(plan: Plan, token: str, units: list[SimpleUnit]) -> str:

@@ -11,6 +11,9 @@ from shared.lattice import Lattice
 MAX_WITNESSES = 255
 """Witnesses are counted in uint8: there can be no more units than that."""
 
+CELLS_A_KEY = 150
+"""Sorting a key takes as long as looking through so many cells of the counter."""
+
 NO_KEYS: NDArray[np.uint32] = np.empty(0, dtype=np.uint32)
 
 
@@ -51,7 +54,11 @@ class MergedMap:
     def voxels(self) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
         """The keys (M,) uint32 of all voxels reported, ascending, and their witnesses (M,) uint8."""
         if self._snapshot is None:
-            keys = np.unique(np.concatenate(list(self._keys.values()) or [NO_KEYS]))
+            reported = sum(map(len, self._keys.values()))
+            if reported * CELLS_A_KEY > self._witnesses.size:
+                keys = np.flatnonzero(self._witnesses != 0).astype(np.uint32)
+            else:
+                keys = np.unique(np.concatenate(list(self._keys.values()) or [NO_KEYS]))
             self._snapshot = keys, self._witnesses[keys]
         return self._snapshot
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from numpy.typing import NDArray
 
-from master_server.merge import MergedMap
+from master_server.merge import CELLS_A_KEY, MergedMap
 from shared.lattice import Lattice
 
 LATTICE = Lattice((0.0, 0.0, 0.0), 0.1, (4, 5, 6))
@@ -52,6 +52,15 @@ def test_withdrawing_takes_out_one_unit_only() -> None:
     merged.withdraw(1)
     merged.withdraw(7)
     assert content(merged) == {2: 1}
+
+
+def test_a_crowded_lattice_and_an_empty_one_are_united_alike() -> None:
+    vast = Lattice((0.0, 0.0, 0.0), 0.1, (40, 50, 60))
+    for reported in (CELLS_A_KEY, 3 * vast.cell_count // CELLS_A_KEY):
+        merged = MergedMap(vast)
+        merged.replace(1, keys(*range(0, 3 * reported, 3)))
+        merged.replace(2, keys(*range(0, 2 * reported, 2)))
+        assert content(merged) == Counter([*range(0, 3 * reported, 3), *range(0, 2 * reported, 2)])
 
 
 def test_an_empty_map_has_no_voxels() -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-import edge_unit.unit
+import edge_unit.source_choice
 from benchmarks.fault_scene import FPS, IMAGE
 from edge_unit.__main__ import main
 from edge_unit.config import SourceConfig
@@ -49,5 +49,5 @@ def make_source(config: SourceConfig) -> DepthSource:
 
 
 if __name__ == "__main__":
-    edge_unit.unit.make_source = make_source
+    edge_unit.source_choice.make_source = make_source
     sys.exit(main(["run", *map(str, map(Path, sys.argv[1:]))]))

@@ -34,19 +34,31 @@ In the order of the flow:
     delay_watch     the same while a unit runs, as a warning
     trust           which master a unit believes, by its certificate
     config          the unit's own configuration
+    source_choice   the source that the configuration chose
     master_choice   which of the masters that were heard of is ours
     master_search   looks for the master while it does not answer
     client          what a unit can ask the master
     cell_cache      the master's cell, kept on disk
     stages          how long a frame spent in each stage of the unit
     uplink          the exchange with the master: latest wins
-    background      the learned reference, kept on disk
-    stance          does the camera still stand where its pose was found
+    host            what the computer itself tells: its boot, its clock, its USB
     camera_memory   the camera that was here, so that its absence can be told
+    camera_standing how the camera is doing, told to the master
+    orders          what the master asked for, by when it is carried out
+    frame_joints    where the robot was when a frame was taken
+    background      the learned reference, kept on disk
+    learning        the background found on disk, or learned from frames
+    stance          does the camera still stand where its pose was found
+    assigned_pipeline  the pipeline as the master's latest assignment has it
+    refining        the pose refined while frames come
+    reporting       a frame as a report: voxels, seen blocks, health
+    frame_work      everything about a frame that takes time
+    board_pose      the pose by the board, found and told to the master
+    errands         work that no frame waits for
+    showing         the pictures that people ask for
     trace           what was reported, frame by frame, in a file
     progress        whether the work on frames makes progress
     unit            the daemon: source, pipeline and uplink held together
-    host            what the computer itself tells: its clock, its USB
     doctor          is all there that a unit needs, and what is to be done if not
     __main__        the command line
 """

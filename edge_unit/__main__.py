@@ -51,7 +51,8 @@ def _run(options: argparse.Namespace) -> int:
     if config.jit_cache_dir is not None:
         settle(config.jit_cache_dir)
     # Imported only now, for kernels settle where they are kept when they are imported.
-    from edge_unit.unit import Unit, make_source
+    from edge_unit.source_choice import make_source
+    from edge_unit.unit import Unit
 
     asyncio.run(_until_told_to_stop(Unit(config, make_source(config.source))))
     return 0

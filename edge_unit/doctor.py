@@ -341,7 +341,7 @@ async def _survey() -> link.Found:
 def _source(config: UnitConfig) -> tuple[DepthSource, Path]:
     """The source, and where compiled kernels are kept: that is settled before the first of them is imported."""
     settled = settle(config.jit_cache_dir)
-    from edge_unit.unit import make_source
+    from edge_unit.source_choice import make_source
 
     return make_source(config.source), settled
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the computer itself tells: whether its clock is set, and which cameras hang on its USB."""
+"""What the computer itself tells: when it was booted, whether its clock is set, which cameras hang on its USB."""
 
 from __future__ import annotations
 
@@ -7,11 +7,21 @@ import ctypes
 from contextlib import suppress
 from pathlib import Path
 
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
 INTEL = "8086"
 
 STA_UNSYNC = 0x40
 TIMEX_BYTES, TIMEX_STATUS_AT = 512, 40
 """See adjtimex(2): more bytes than its structure has, and where the status lies in it on every 64-bit Linux."""
+
+
+def boot_id() -> str:
+    """Changes when the machine's monotonic clock starts anew."""
+    try:
+        return BOOT_ID.read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
 
 
 def clock_is_set() -> bool:

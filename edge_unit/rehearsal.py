@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every kernel, compiled or read from disk before the first frame, and before anyone knows where the camera stands."""
+"""Every kernel, compiled or read from disk before the first frame; most before anyone knows where the camera stands."""
 
 from __future__ import annotations
+
+import gc
 
 import numpy as np
 
@@ -31,6 +33,22 @@ def rehearse() -> None:
     pipeline = DepthPipeline(CAMERA, identity(), cell)
     for joint_rad in (0.0, 0.1):
         pipeline.process(np.full(CAMERA.shape, DEPTH_MM, np.uint16), np.array([joint_rad]))
+    _look(pipeline)
+
+
+def warm_up(pipeline: DepthPipeline) -> None:
+    """Have all that `pipeline` needs ready, by a frame that shows nothing."""
+    robot = pipeline.cell.robot
+    joints = None if robot is None else np.zeros(robot.joint_count)
+    pipeline.process(np.zeros(pipeline.intrinsics.shape, np.uint16), joints)
+    _look(pipeline)
+    # What is there now stays; without this, each full collection looks through it, and a frame waits 0.1 s.
+    gc.collect()
+    gc.freeze()
+
+
+def _look(pipeline: DepthPipeline) -> None:
+    """All that is asked of a frame."""
     pipeline.health()
     pipeline.seen()
     pipeline.misfit()

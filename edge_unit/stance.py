@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.misfit import STEPS, Misfit
+from edge_unit.pipeline import DepthPipeline
 from shared.clock import NS_PER_S
 
 logger = logging.getLogger(__name__)
@@ -165,6 +166,15 @@ class Stance:
         else:
             self._gathered = _NOTHING
         return self._verdict
+
+    def watch(self, pipeline: DepthPipeline, captured_at_ns: int) -> Verdict:
+        """Look at the frame that was processed last, when that is due; the log tells when the verdict changes."""
+        if not self.due(captured_at_ns):
+            return self._verdict
+        before, verdict = self._verdict, self.judge(pipeline.misfit(), pipeline.static_version, captured_at_ns)
+        if bool(verdict.reason) != bool(before.reason):
+            logger.warning("%s", verdict.reason or "the camera stands where it stood, and sees")
+        return verdict
 
     @property
     def verdict(self) -> Verdict:

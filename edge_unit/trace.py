@@ -18,6 +18,7 @@ from typing import Any
 
 import msgpack
 
+from edge_unit.uplink import Delivery, Report
 from shared.errors import ConfigError
 
 logger = logging.getLogger(__name__)
@@ -63,6 +64,27 @@ class Trace:
     def add(self, record: TraceRecord) -> None:
         """Keep a record for the next `flush`."""
         self._pending.append(record)
+
+    def note(self, report: Report, delivery: Delivery | None) -> None:
+        """Keep what became of a report; without a `delivery` it was never sent."""
+        if report.captured_at_ns is None:
+            return
+        lattice = report.assignment.lattice
+        self.add(
+            TraceRecord(
+                report.health.frame,
+                report.captured_at_ns,
+                report.health.process_ms,
+                report.keys,
+                lattice.shape,
+                lattice.voxel_size_m,
+                delivery is not None,
+                None if delivery is None else delivery.merged_at_ns,
+                None if delivery is None else delivery.sent_at_ns,
+                None if delivery is None else delivery.received_at_ns,
+                report.stages_ns,
+            )
+        )
 
     def flush(self) -> None:
         """Write what was collected; ends quietly at the file's bound."""

@@ -19,11 +19,14 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_unit import board_search as board_search_module
+from edge_unit import reporting as reporting_module
 from edge_unit import unit as unit_module
 from edge_unit import uplink as uplink_module
 from edge_unit.board_layout import BoardLayout
 from edge_unit.client import MasterClient
 from edge_unit.config import PoseConfig, UnitConfig
+from edge_unit.frame_work import FrameWork
+from edge_unit.refining import REFINE_FRAMES
 from edge_unit.rehearsal import rehearse
 from edge_unit.sources.frame import CameraInfo, DepthFrame
 from edge_unit.sources.image import ImageFrame, ImageInfo, ImageStream
@@ -189,7 +192,7 @@ async def test_of_too_many_voxels_the_nearest_are_reported_and_the_rest_is_not_s
         assert row.reason == ""
         near = {index for index in everything if index[2] == 9}
         assert 20 <= len(near) < len(everything)
-        monkeypatch.setattr(unit_module, "MAX_VOXELS", len(near))
+        monkeypatch.setattr(reporting_module, "MAX_VOXELS", len(near))
         bench.show(depth)
         warning = (
             f"{len(everything)} obstacle voxels: the {len(near)} nearest are reported, the rest counts as not seen"
@@ -222,7 +225,7 @@ async def test_a_frame_that_hangs_is_told_and_waiting_for_a_camera_is_not(
         await bench.until(lambda: bench.source.opened >= 2, "a camera that is opened again")
         bench.show(patch(1225))
         await bench.until(lambda: (row := bench.row()) and row.health.frame == 1, "a frame")
-        monkeypatch.setattr(Unit, "_process", lambda *_: release.wait(30.0))
+        monkeypatch.setattr(FrameWork, "process", lambda *_: release.wait(30.0))
         bench.show(patch(1225))
         stuck = await bench.until(bench.unit.stuck, "a frame that hangs")
         assert stuck.startswith("frame 2 has not come to its end for 0 s")
@@ -314,7 +317,7 @@ async def test_another_camera_registers_anew_and_its_pose_is_void(tmp_path: Path
         # So long the master holds another camera at this address for another unit.
         bench.master.change_settings({"stale_after_s": 0.5})
         bench.config = bench.config.model_copy(update={"T_world_camera": None})
-        bench.unit._pose = None
+        bench.unit._camera.known_pose = None
         bench.source.serial = "B"
         bench.show(SourceError("unplugged"))
         row = await bench.until_state("uncalibrated")
@@ -353,13 +356,13 @@ async def test_another_master_never_gets_voxels_of_the_first_ones_lattice(tmp_pa
 async def test_joints_of_the_frames_time_reach_the_pipeline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = await asyncio.to_thread(Bench, tmp_path, with_robot=True)
     used: list[Any] = []
-    report = unit_module.Unit._report
+    report = FrameWork._report
 
-    def spy(unit: Any, pipeline: Any, assignment: Any, frame: Any, joints: Any, stages: Any) -> Any:
+    def spy(work: Any, pipeline: Any, assignment: Any, frame: Any, joints: Any, stages: Any) -> Any:
         used.append(joints)
-        return report(unit, pipeline, assignment, frame, joints, stages)
+        return report(work, pipeline, assignment, frame, joints, stages)
 
-    monkeypatch.setattr(unit_module.Unit, "_report", spy)
+    monkeypatch.setattr(FrameWork, "_report", spy)
     async with bench.running():
         bench.show(patch(FAR_MM))
         await bench.until(lambda: used, "a frame without joints")
@@ -381,15 +384,15 @@ async def test_joints_whose_times_are_late_are_looked_up_later(tmp_path: Path, m
     """The robot turns at 1 rad/s; the delay is told while the unit runs."""
     bench = await asyncio.to_thread(Bench, tmp_path, with_robot=True)
     ahead_s: list[float | None] = []
-    report = unit_module.Unit._report
+    report = FrameWork._report
     began_ns = monotonic_ns()
 
     def turned(at_ns: int) -> float:
         return (at_ns - began_ns) / NS_PER_S
 
-    def spy(unit: Any, pipeline: Any, assignment: Any, frame: Any, joints: Any, stages: Any) -> Any:
+    def spy(work: Any, pipeline: Any, assignment: Any, frame: Any, joints: Any, stages: Any) -> Any:
         ahead_s.append(None if joints is None else joints.positions[1] - turned(frame.captured_at_ns))
-        return report(unit, pipeline, assignment, frame, joints, stages)
+        return report(work, pipeline, assignment, frame, joints, stages)
 
     def has_more_than(count: int) -> bool:
         return len(ahead_s) > count
@@ -405,7 +408,7 @@ async def test_joints_whose_times_are_late_are_looked_up_later(tmp_path: Path, m
             if ahead_s[-1] is not None:
                 return ahead_s[-1]
 
-    monkeypatch.setattr(unit_module.Unit, "_report", spy)
+    monkeypatch.setattr(FrameWork, "_report", spy)
     async with bench.running():
         assert await ahead() == pytest.approx(0.0, abs=0.02)
         bench.master.change_settings({"joint_delay_s": 0.05})
@@ -496,7 +499,7 @@ class RefineBench(Bench):
         """Ask for it, show frames, and wait for what became of it."""
         asked = self.master.ask(1, "refine", monotonic_ns())
         await self.until(lambda: not self.unit.uplink.commands.empty(), "the command")
-        for _ in range(unit_module.REFINE_FRAMES):
+        for _ in range(REFINE_FRAMES):
             self.show(self.frame)
 
         def told() -> CommandRow | None:
@@ -541,7 +544,7 @@ async def test_a_refined_pose_keeps_what_was_learned(tmp_path: Path) -> None:
         assert (await bench.refine()).outcome != DONE
         bench.show(bench.frame)
         row = await bench.until_state("live")
-        pipeline = bench.unit._pipeline
+        pipeline = bench.unit._assigned.pipeline
         assert pipeline is not None
         assert pipeline.reference is not None
         assert np.array_equal(pipeline.T_world_camera, np.array(row.T_world_camera))

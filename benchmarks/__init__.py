@@ -45,4 +45,8 @@ In the order of the flow:
     viewer       the operator's window in a real browser, and what those who look cost the units
     machines     machines that boot systemd from one read-only root file system
     rehearsal    three units and a master as such machines: switched on, failing, coming back
+    parts        each part of the report: its command, the question that it answers, how long it may take
+    plots        curves as pictures
+    report_page  all results as one page
+    bench        those that fit into twenty minutes, and the page
 """

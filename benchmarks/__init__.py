@@ -45,8 +45,13 @@ In the order of the flow:
     viewer       the operator's window in a real browser, and what those who look cost the units
     machines     machines that boot systemd from one read-only root file system
     rehearsal    three units and a master as such machines: switched on, failing, coming back
-    parts        each part of the report: its command, the question that it answers, how long it may take
-    plots        curves as pictures
-    report_page  all results as one page
-    bench        those that fit into twenty minutes, and the page
+    paper_scene  the paper's cell: a UR3, a person, four cameras
+    paper_contenders one unit at its frame, all cameras in one process, all cameras into one octree
+    paper_master a real master, and what it takes to bring voxels to it
+    paper_book   what was measured, by contender, resolution, voxel size and number of cameras
+    paper_composed a refresh if each unit had a computer of its own, in turns with the centralised ways
+    paper_unit   one unit as a process
+    paper_running a refresh by such processes on this machine
+    paper_tables the paper's tables anew, and beside them what it states
+    paper        the paper's experiment, in one command
 """

@@ -12,7 +12,6 @@ from typing import Any
 from edge_unit.client import MasterClient
 from shared.cell import Cell
 from shared.errors import CellwatchError, WireError
-from shared.files import write_whole
 from shared.messages import CellReference
 
 logger = logging.getLogger(__name__)
@@ -86,13 +85,13 @@ class CellCache:
 
     def _write(self, name: str, data: bytes) -> None:
         """Whole or not at all; a disk that is full costs the cache, not the unit."""
-        path = self._folder / name
+        partial = self._folder / f"{name}.partial"
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            # What a power cut damages is found by its hash and fetched again; a start waits for no disk.
-            write_whole(path, data, synced=False)
+            partial.write_bytes(data)
+            partial.replace(self._folder / name)
         except OSError as error:
-            logger.warning("%s: the cell cannot be kept: %s", path, error)
+            logger.warning("%s: the cell cannot be kept: %s", partial, error)
 
     def _keep_only(self, names: set[str]) -> None:
         try:

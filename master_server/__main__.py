@@ -46,7 +46,6 @@ from shared.clock import monotonic_ns
 from shared.configuration import assignments, load
 from shared.discovery import Announcement, Announcer, only_loopback
 from shared.errors import CellwatchError, ConfigError
-from shared.files import write_whole
 from shared.messages import CONTRACT_VERSION
 from shared.service import ServiceManager
 
@@ -119,7 +118,9 @@ class _Server(uvicorn.Server):
         gc.freeze()
         text = json.dumps(self._ready)
         if self._ready_file is not None:
-            write_whole(self._ready_file, f"{text}\n".encode(), synced=False)
+            partial = self._ready_file.with_suffix(".partial")
+            partial.write_text(text + "\n")
+            partial.replace(self._ready_file)
         print(f"master-server: listening at {self._ready['url']}{self._everywhere}", flush=True)
         for role in Role:
             lies_in = self._ready[f"{role.value}_token_file"]

@@ -12,7 +12,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from shared.configuration import sentence
 from shared.errors import SourceError
-from shared.files import write_whole
 
 
 class Handling(BaseModel):
@@ -31,7 +30,9 @@ class Handling(BaseModel):
 
     def write(self, path: Path) -> None:
         """From now on this is done to the camera that looks at `path`."""
-        write_whole(path, self.model_dump_json().encode(), synced=False)
+        written = path.with_suffix(".new")
+        written.write_text(self.model_dump_json(), encoding="utf-8")
+        written.replace(path)
 
 
 LEFT_ALONE = Handling()

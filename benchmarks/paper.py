@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`make bench-paper`: the experiment of the paper that the method comes from, on this machine.
+
+The scene's refresh by resolution, voxel size (10 to 100 mm) and number of cameras (one to four), distributed and
+centralised, all contenders in turns on the same frames. Every map is held against what the frames must give.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from benchmarks import paper_composed, paper_master, paper_running
+from benchmarks import paper_tables as tables
+from benchmarks.paper_book import (
+    CONTENDERS,
+    ONE_OCTREE,
+    ONE_PROCESS,
+    ONE_PROCESS_BESIDE,
+    UNITS_COMPOSED,
+    UNITS_RUNNING,
+    UNITS_SAME_FRAMES,
+    Book,
+    in_mm,
+)
+from benchmarks.paper_scene import Views, views, write_cell
+from benchmarks.pipeline import machine
+from benchmarks.report import RESULTS, Mark, Result, line, write
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.errors import CellwatchError
+from simulation.fleet import MASTER_PREFIX
+from simulation.processes import Processes
+
+VOXEL_M = 0.02
+"""Where one size stands for all."""
+
+
+@dataclass(frozen=True)
+class Amount:
+    """How much of everything."""
+
+    resolutions: tuple[tuple[int, int], ...] = ((424, 240), (640, 480), (1280, 720))
+    sizes_m: tuple[float, ...] = tuple(mm / 1e3 for mm in range(10, 101, 10))
+    frames: int = 4
+    rounds: int = 20
+    octree_rounds: Mapping[float, int] = field(default_factory=lambda: dict.fromkeys((0.01, 0.02, 0.05, 0.1), 3))
+    running_sizes_m: tuple[float, ...] = (0.01, 0.02, 0.05)
+    running_rounds: int = 12
+    same_rounds: int = 60
+
+
+QUICK = Amount(
+    resolutions=((424, 240),),
+    sizes_m=(0.01, 0.02, 0.05),
+    frames=2,
+    rounds=4,
+    octree_rounds={0.02: 1, 0.05: 1},
+    running_sizes_m=(0.02,),
+    running_rounds=3,
+    same_rounds=8,
+)
+
+
+async def measure(amount: Amount) -> tuple[Book, Book, list[paper_composed.Parts]]:
+    """All that is measured: in the second book all cameras have the same frames."""
+    book, same = Book(), Book()
+    parts: list[paper_composed.Parts] = []
+    cores = sorted(os.sched_getaffinity(0))
+    with tempfile.TemporaryDirectory(prefix="cellwatch-paper-") as scratch, _told("all of it"):
+        folder = Path(scratch)
+        with _told("frames rendered"):
+            seen = [views(*size, amount.frames) for size in amount.resolutions]
+        write_cell(seen[0].cell, folder / "cell.yaml")
+        async with Processes(folder / "logs", without=(MASTER_PREFIX,)) as processes:
+            site = await paper_master.start(processes, folder, folder / "cell.yaml")
+            site.pin({cores[-1]})
+            os.sched_setaffinity(0, {cores[0]})
+            try:
+                for each in seen:
+                    with _told(f"{each.name}, composed and centralised"):
+                        bench = paper_composed.Bench(site, each, UNITS_COMPOSED, book)
+                        parts += await bench.run(amount.sizes_m, amount.rounds, amount.octree_rounds)
+                with _told("all cameras with the same frames"):
+                    bench = paper_composed.Bench(site, seen[-1].of_one(0), UNITS_SAME_FRAMES, same)
+                    await bench.run((VOXEL_M,), amount.same_rounds, {})
+            finally:
+                os.sched_setaffinity(0, cores)
+            site.pin(set(cores))
+            with _told("units as processes"):
+                await _run_units(site, seen, folder, amount, book)
+    return book, same, parts
+
+
+async def _run_units(site: paper_master.Site, seen: Sequence[Views], folder: Path, amount: Amount, book: Book) -> None:
+    with paper_running.running(site) as units:
+        for each in seen:
+            bench = paper_running.Bench(site, units, each, folder, book)
+            await bench.run(amount.running_sizes_m, amount.running_rounds)
+
+
+def results_of(book: Book, same: Book, parts: Sequence[paper_composed.Parts]) -> dict[str, Result]:
+    """The tables, by name."""
+    voxel_mm = in_mm(VOXEL_M)
+    largest = parts[-1].resolution
+    (default,) = [each for each in parts if (each.resolution, each.voxel_mm) == (largest, voxel_mm)]
+    first, slowest = tables.views_ratio(default)
+    by_cameras = tables.by_cameras(book, (UNITS_COMPOSED, ONE_PROCESS, ONE_OCTREE), voxel_mm)
+    figure = Result(
+        by_cameras.title,
+        by_cameras.columns,
+        by_cameras.rows,
+        tables.marks(book, same, largest, voxel_mm),
+        (
+            f"With different views, {largest}, {voxel_mm} mm: four cameras take {first:.2f} refreshes of the first "
+            f"alone, {slowest:.2f} of the slowest alone.",
+        ),
+    )
+    return {
+        "table_2_distributed": tables.by_size(book, UNITS_COMPOSED),
+        "table_1_centralised_same_filter": tables.by_size(book, ONE_PROCESS),
+        "table_1_centralised_octree": tables.by_size(book, ONE_OCTREE),
+        "table_2_faster": tables.faster_by_resolution(book),
+        "figure_12_by_cameras": figure,
+        "figure_12_faster": tables.faster(book, UNITS_COMPOSED, (ONE_PROCESS, ONE_OCTREE)),
+        "running": tables.running(book),
+        "running_faster": tables.faster(book, UNITS_RUNNING, (ONE_PROCESS_BESIDE,)),
+        "anatomy": tables.anatomy(parts),
+        "beside_the_paper": tables.beside_the_paper(book, parts),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, print the tables, and all of it as one line of JSON. Exit code 1 when a mark is missed."""
+    options = _parser().parse_args(arguments)
+    before, began_ns = os.getloadavg()[0], monotonic_ns()
+    try:
+        found = asyncio.run(measure(QUICK if options.quick else Amount()))
+    except (CellwatchError, ImportError) as error:
+        print(f"make bench-paper: {error}", file=sys.stderr)
+        return 1
+    results = results_of(*found)
+    print("\n".join(f"\n{result}" for result in results.values()))
+    book, same, _ = found
+    marks: list[Mark] = [mark for result in results.values() for mark in result.marks]
+    rows = [*book.rows(), *(row for row in same.rows() if row["contender"] == UNITS_SAME_FRAMES)]
+    document: dict[str, Any] = {
+        "title": "The paper's experiment: the scene's refresh, distributed and centralised",
+        "contenders": CONTENDERS,
+        "paper": tables.STATED,
+        **{name: result.document() for name, result in results.items()},
+        "measurements": rows,
+        "marks": [mark.document() for mark in marks],
+        "passed": all(mark.met for mark in marks),
+        "machine": machine() | {"cores": len(os.sched_getaffinity(0))},
+        "load_average_before": before,
+        "seconds": round((monotonic_ns() - began_ns) / NS_PER_S, 1),
+        "quick": options.quick,
+    }
+    if options.results or not options.quick:
+        write("paper", document, options.results or RESULTS)
+    print(line(document))
+    return 0 if document["passed"] else 1
+
+
+@contextmanager
+def _told(what: str) -> Iterator[None]:
+    """Say how long it took, when it is done."""
+    began_ns = monotonic_ns()
+    yield
+    print(f"{what}: {(monotonic_ns() - began_ns) / NS_PER_S:.0f} s", file=sys.stderr, flush=True)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="make bench-paper", description="The paper's experiment on this machine.")
+    parser.add_argument("--quick", action="store_true", help="little of everything, within a minute")
+    parser.add_argument("--results", type=Path, metavar="DIR", help="for paper.json, also of a quick run")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What was measured, by contender, resolution, voxel size and number of cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+UNITS_COMPOSED = "distributed, composed"
+UNITS_RUNNING = "distributed, as it runs on this machine"
+ONE_PROCESS = "centralised, the same filter"
+ONE_PROCESS_BESIDE = "centralised, the same filter, in turns with processes"
+ONE_OCTREE = "centralised, as MoveIt's updaters"
+UNITS_SAME_FRAMES = "distributed, composed, all cameras with the same frames"
+
+CONTENDERS = {
+    UNITS_COMPOSED: "Each unit's work (process(), seen(), health()) on a core of its own, then its update by the "
+    "units' own client over HTTP on loopback to a real master; the slowest counts. To it are added what the updates "
+    "of all units at the same moment take longer than one, and the master's merge.",
+    UNITS_RUNNING: "One process for each unit and one for the master, which share the cores of this machine: from "
+    "handing all units their frames at once until GET /voxels has brought a map that holds all of them.",
+    ONE_PROCESS: "The pipelines of all cameras in turn in one process on one core, and the master's own merge "
+    "there. In its favour: it finds the depth images in its memory, however they come there.",
+    ONE_PROCESS_BESIDE: "The same, measured in turns with the processes, not pinned to a core.",
+    ONE_OCTREE: "All cameras in turn on one core: CAD and robot masked out of the depth image, points, "
+    "OctoMap.insertPointCloud with free-space rays (discretized) into one octree. In its favour: no rays to what is "
+    "CAD or robot, though MoveIt casts them, and nobody else locks the octree.",
+    UNITS_SAME_FRAMES: "As composed, but all cameras see what the first one sees, so that only their number changes.",
+}
+
+
+class Key(NamedTuple):
+    """Which measurement."""
+
+    contender: str
+    resolution: str
+    voxel_mm: int
+    cameras: int
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Milliseconds of several refreshes."""
+
+    median_ms: float
+    p99_ms: float
+    least_ms: float
+    most_ms: float
+    samples: int
+
+
+class Book:
+    """Collects milliseconds."""
+
+    def __init__(self) -> None:
+        self._samples: dict[Key, list[float]] = {}
+
+    def add(self, contender: str, resolution: str, voxel_size_m: float, until_ms: Iterable[float]) -> None:
+        """What refreshes of one camera, two, and so on took in one round."""
+        for cameras, value in enumerate(until_ms, 1):
+            self._samples.setdefault(Key(contender, resolution, in_mm(voxel_size_m), cameras), []).append(value)
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._samples
+
+    def spread(self, key: Key) -> Spread:
+        """What was measured under `key`.
+
+        Raises:
+            KeyError: nothing was.
+        """
+        values = self._samples[key]
+        median, p99 = np.percentile(values, (50, 99))
+        return Spread(float(median), float(p99), min(values), max(values), len(values))
+
+    def median(self, contender: str, resolution: str, voxel_mm: int, cameras: int) -> float:
+        """In milliseconds; NaN where nothing was measured."""
+        key = Key(contender, resolution, voxel_mm, cameras)
+        return self.spread(key).median_ms if key in self else float("nan")
+
+    def __iter__(self) -> Iterator[Key]:
+        """All measurements, in the order in which they were begun."""
+        return iter(self._samples)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """All of it as plain values."""
+        found = []
+        for key in self._samples:
+            spread = self.spread(key)
+            figures = {name: round(value, 4) for name, value in spread.__dict__.items() if name != "samples"}
+            found.append({**key._asdict(), **figures, "samples": spread.samples})
+        return found
+
+
+def in_mm(voxel_size_m: float) -> int:
+    """A voxel's edge as people say it."""
+    return round(1e3 * voxel_size_m)

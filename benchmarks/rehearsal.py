@@ -3,8 +3,9 @@
 
 Each machine is a container with systemd, the services of `deploy/systemd` and the root file system that
 `deploy/image/customize-rootfs` made, the three units from the very same one. Measured are the seconds from switching
-a unit on to its first merged voxel, compiled kernels there or not, and how long each fault keeps a unit from being
-live. Prints the table, and at the end all of it as one line of JSON; exits with 1 when a mark is missed. Needs root.
+a unit on to its first merged voxel, with kernels that its image carries and without, and how long each fault keeps a
+unit from being live. Prints the table, and at the end all of it as one line of JSON; exits with 1 when a mark is
+missed. Needs root.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ MASTER_IP, MASTER_URL = "10.77.0.1", "http://10.77.0.1:8420"
 
 UNIT, MASTER = "edge-unit.service", "master-server.service"
 
-COLD_S_MAX, WARM_S_MAX = 10.0, 5.0
-"""From switching on to the first voxel, with no kernel compiled yet, and with all of them."""
+FIRST_S_MAX, WARM_S_MAX = 10.0, 5.0
+"""From switching on to the first voxel: at a board's first boot, its own cache empty, and at later ones."""
 
 WATCHDOG_S = 10.0
 """As in the unit files."""
@@ -48,8 +49,10 @@ WATCHDOG_S = 10.0
 RESTART_S_MAX = 8.0
 """For systemd to start a service again, a second of waiting included, and for a unit to be live, kernels compiled."""
 
-BOOT_S_MAX = 180.0
-"""Until it is given up: three units that compile at once on a busy computer."""
+UNITS = 3
+
+BOOT_S_MAX = 400.0
+"""Until it is given up: a unit that compiles everything on a very busy computer."""
 
 FULL_BYTES = 64 * 1024 * 1024
 """The size of a disk that is filled; state and settings of a unit take a hundredth."""
@@ -113,16 +116,22 @@ class Site:
 
 
 def switch_on(site: Site) -> dict[str, Any]:
-    """The first unit alone, as a board of its own would be: kernels to be compiled first, and then from its disk."""
-    unit = site.units[0]
-    cold_s = _first_voxel_s(site, unit)
-    # An image may carry the kernels that one board has compiled: what follows is also the first boot of such a one.
+    """Units alone, as a board of its own would be: with the kernels that its image carries, again, and without any."""
+    unit, bare = site.units[0], site.units[-1]
+    carried_s = _first_voxel_s(site, unit)
+    compiled = unit.run("find", "/var/cache/private", "-name", "*.nbc", "-type", "f").split()
     unit.cut_power()
     site.until_not_live(unit)
     warm_s = _first_voxel_s(site, unit)
     boot = re.search(r"finished in ([\d.]+)s", unit.run("systemd-analyze"))
     boot_s = float(boot.group(1)) if boot else math.nan
-    return {"cold_s": round(cold_s, 2), "warm_s": round(warm_s, 2), "systemd_s": boot_s}
+    return {
+        "carried_s": round(carried_s, 2),
+        "compiled": len(compiled),
+        "warm_s": round(warm_s, 2),
+        "cold_s": round(_first_voxel_s(site, bare), 2),
+        "systemd_s": boot_s,
+    }
 
 
 def _first_voxel_s(site: Site, unit: Machine) -> float:
@@ -132,7 +141,7 @@ def _first_voxel_s(site: Site, unit: Machine) -> float:
 
 def join(site: Site) -> dict[str, Any]:
     """The others, from the same root file system; every machine must have made a name of its own."""
-    for unit in site.units[1:]:
+    for unit in site.units[1:-1]:
         unit.power_on()
     for unit in site.units[1:]:
         site.until_live(unit)
@@ -268,6 +277,8 @@ def site_of(roots: Path, folder: Path) -> Iterator[Site]:
     hanging.mkdir()
     (hanging / "hanging_unit.py").write_text(HANGING_UNIT)
     (hanging / "hang.conf").write_text(HANGING_SERVICE)
+    nothing = folder / "nothing"
+    nothing.mkdir()
     with ExitStack() as stack:
         master = stack.enter_context(Machine("master", roots / "master", MASTER_IP, folder / "master"))
         # The token that the units' image carries was this master's.
@@ -276,7 +287,7 @@ def site_of(roots: Path, folder: Path) -> Iterator[Site]:
         (state / "unit.token").write_text((roots / "unit.token").read_text())
         (state / "unit.token").chmod(0o600)
         units = []
-        for number in range(3):
+        for number in range(UNITS):
             name = f"unit{number + 1}"
             for part in ("state", "cache"):
                 (folder / name / part).mkdir(parents=True, mode=0o700)
@@ -285,8 +296,12 @@ def site_of(roots: Path, folder: Path) -> Iterator[Site]:
                 stack.callback(run, "umount", "--lazy", str(folder / name / part))
             config = (roots / "unit.yaml").read_text().replace("cameras: 3", f"cameras: 3, camera: {number}")
             (folder / name / "unit.yaml").write_text(config)
-            binds = (f"{hanging}:/opt/hanging-unit", f"{folder / name}/unit.yaml:/etc/cellwatch/unit.yaml")
-            unit = Machine(name, roots / "unit", f"10.77.0.{11 + number}", folder / name, binds)
+            binds = [f"{hanging}:/opt/hanging-unit", f"{folder / name}/unit.yaml:/etc/cellwatch/unit.yaml"]
+            if number == UNITS - 1:
+                # This one's image carries no kernels.
+                release = (roots / "unit" / "opt" / "cellwatch" / "current").readlink()
+                binds.append(f"{nothing}:/opt/cellwatch/{release}/kernels")
+            unit = Machine(name, roots / "unit", f"10.77.0.{11 + number}", folder / name, tuple(binds))
             units.append(stack.enter_context(unit))
         master.power_on()
         token = state / "operator.token"
@@ -335,8 +350,9 @@ def marks(document: dict[str, Any]) -> list[Mark]:
     """What the figures are held against."""
     on, joined = document["switch_on"], document["join"]
     return [
-        Mark("seconds from power-on to the first voxel, nothing compiled", on["cold_s"], at_most=COLD_S_MAX),
-        Mark("the same, kernels compiled before", on["warm_s"], at_most=WARM_S_MAX),
+        Mark("seconds from power-on to the first voxel, first boot", on["carried_s"], at_most=FIRST_S_MAX),
+        Mark("kernels compiled at the first boot", on["compiled"], at_most=0),
+        Mark("seconds from power-on to the first voxel, later boots", on["warm_s"], at_most=WARM_S_MAX),
         Mark("units that report", joined["machines_posting"], at_least=3),
         Mark("distinct host names", joined["distinct_names"], at_least=3),
         Mark("seconds to stop", document["stop_s"], at_most=2.0),

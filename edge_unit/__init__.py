@@ -3,6 +3,7 @@
 
 In the order of the flow:
 
+    carried_kernels compiled kernels that came with the release, for a named processor
     jit_cache       where compiled kernels are kept, settled before the first is imported
     kernels/        the arithmetic, as pure numba functions on arrays
     sources/        where frames come from

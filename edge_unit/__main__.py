@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `run` watches until told to stop, `doctor` looks for what is wrong, and three more.
+"""The command line: `run` watches until told to stop, `doctor` looks for what is wrong, and four more.
 
 `record-images` makes a recording of images, `joint-delay` tells how late a recording's joints are, `board` makes a PDF
-of the calibration board.
+of the calibration board, `compile-kernels` what an image carries so that boards need not compile.
 """
 
 from __future__ import annotations
@@ -11,17 +11,21 @@ import argparse
 import asyncio
 import logging
 import os
+import platform
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from edge_unit.carried_kernels import TARGETS, target_of
 from edge_unit.config import ENVIRONMENT_PREFIX, UnitConfig
-from edge_unit.jit_cache import settle
+from edge_unit.jit_cache import settle, settle_for
+from edge_unit.sources.frame import DepthSource
 from edge_unit.sources.recorded import RecordedSourceConfig
+from edge_unit.sources.simulated import SimulatedSource, SimulatedSourceConfig
 from shared.configuration import assignments, load
-from shared.errors import CellwatchError
+from shared.errors import CellwatchError, ConfigError
 from shared.service import ServiceManager
 
 if TYPE_CHECKING:
@@ -113,6 +117,32 @@ def _board(options: argparse.Namespace) -> int:
     return 0
 
 
+def _compile_kernels(options: argparse.Namespace) -> int:
+    targets = {target.name: target for target in TARGETS}
+    target = targets[options.target] if options.target else target_of(platform.machine())
+    if target is None or target.machine != platform.machine():
+        raise ConfigError(f"--target: kernels are compiled on {platform.machine()} for {platform.machine()} only")
+    folder = settle_for(target, options.folder)
+    from edge_unit.rehearsal import rehearse
+
+    rehearse()
+    if options.config is not None:
+        source = load(UnitConfig, options.config, os.environ, ENVIRONMENT_PREFIX, {}).source
+        if isinstance(source, SimulatedSourceConfig):
+            asyncio.run(_look_once(SimulatedSource(source)))
+    print(f"{folder}: {len(list(folder.rglob('*.nbi')))} kernels for {target.name}")
+    return 0
+
+
+async def _look_once(source: DepthSource) -> None:
+    await source.open()
+    try:
+        async for _ in source.frames():
+            break
+    finally:
+        await source.close()
+
+
 async def _until_told_to_stop(unit: Unit) -> None:
     """Run to the end, or to a signal, and keep the service manager informed."""
     task = asyncio.ensure_future(unit.run())
@@ -165,7 +195,20 @@ def _parser() -> argparse.ArgumentParser:
     board.add_argument("--cell", type=Path, required=True, metavar="CELL.YAML", help="the cell that has the board")
     board.add_argument("--out", type=Path, required=True, metavar="BOARD.PDF")
     board.add_argument("--page", help="A4 to A0 (default: the smallest that the board fits on)")
-    board.add_argument("--log-level", default="WARNING", choices=levels)
+    compiled = commands.add_parser("compile-kernels", help="compiled kernels that boards of one kind can share")
+    compiled.set_defaults(command=_compile_kernels)
+    compiled.add_argument("folder", type=Path, metavar="DIR")
+    compiled.add_argument(
+        "config",
+        type=Path,
+        nargs="?",
+        metavar="CONFIG.YAML",
+        help="a unit's configuration: those of its simulated camera too",
+    )
+    names = [target.name for target in TARGETS]
+    compiled.add_argument("--target", choices=names, help="kind of processor (default: this computer's)")
+    for each in (board, compiled):
+        each.add_argument("--log-level", default="WARNING", choices=levels)
     for each in (run, doctor, record, delay):
         each.add_argument(
             "--set", action="append", default=[], metavar="NAME=VALUE", help="one value of the configuration"

@@ -5,7 +5,8 @@ numba looks for a folder that it can write when a kernel is *defined*, and raise
 without a home of its own would not even start. A folder that was filled before but is read-only counts as none.
 
 It compiles a kernel anew when the kernel's own file has changed, and not when that of a kernel or a constant has which
-it uses. So each state of all the kernels has a folder of its own.
+it uses. So each state of all the kernels has a folder of its own. Kernels that came with the release are found in it,
+where they fit (`carried_kernels`); otherwise they are compiled for this very processor.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
+from edge_unit.carried_kernels import PREFIX, Target, carried, link
 from shared.errors import JitCacheError
 
 logger = logging.getLogger(__name__)
@@ -33,9 +35,6 @@ STATES_MAX = 3
 
 PRIVATE = "cellwatch-jit-"
 """Of a temporary folder, which is gone after the next boot."""
-
-PREFIX = "kernels-"
-"""Of the folders' names; the rest is a digest of the source."""
 
 
 def settle(directory: Path | str | None = None) -> Path:
@@ -66,9 +65,30 @@ def settle(directory: Path | str | None = None) -> Path:
     return _use(private)
 
 
+def settle_for(target: Target, directory: Path) -> Path:
+    """Have all kernels compiled for `target`, to be carried by a release, into a folder below `directory`.
+
+    Raises:
+        JitCacheError: it cannot be written.
+    """
+    folder = directory / target.name / f"{PREFIX}{_state_of_kernels()}"
+    if not _writable(folder):
+        raise JitCacheError(f"{folder} cannot be written")
+    target.choose()
+    _tell_numba(folder)
+    return folder
+
+
 def _use(parent: Path) -> Path:
-    folder = parent / f"{PREFIX}{_state_of_kernels()}"
-    os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    state = _state_of_kernels()
+    folder = parent / f"{PREFIX}{state}"
+    found = carried(state)
+    if found is not None:
+        target, kernels = found
+        # Where not even links can be made, it is compiled for this processor.
+        with suppress(OSError):
+            folder = link(kernels, parent)
+            target.choose()
     with suppress(OSError):
         # A folder that another process is taking out at the same time is as good as taken out.
         folder.mkdir(exist_ok=True)
@@ -76,12 +96,17 @@ def _use(parent: Path) -> Path:
         states = sorted(parent.glob(f"{PREFIX}*"), key=lambda path: path.stat().st_mtime)
         for old in states[:-STATES_MAX]:
             shutil.rmtree(old, ignore_errors=True)
+    _tell_numba(folder)
+    return folder
+
+
+def _tell_numba(folder: Path) -> None:
+    os.environ["NUMBA_CACHE_DIR"] = str(folder)
     if "numba" in sys.modules:
         # It reads the variable only when it is imported.
         import numba
 
         numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]  # numba sets its options from outside
-    return folder
 
 
 def _state_of_kernels() -> str:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from shared.cell import Cell
 from shared.errors import WireError
 from shared.lattice import Lattice
-from shared.messages import SeenReport
+from shared.messages import Matrix, SeenReport
 from shared.wire import unpack_seen
 
 MAX_BLOCKS = 2**17
@@ -68,6 +68,21 @@ class Coverage:
     def has(self, unit_id: int) -> bool:
         """Whether the unit has reported."""
         return unit_id in self._seen
+
+    def range_m(self, unit_id: int, T_world_camera: Matrix) -> float | None:
+        """Depth of the farthest block that a unit looks through, in its camera's frame; None while nothing is known."""
+        seen = self._seen.get(unit_id)
+        if seen is None:
+            return None
+        ix, iy, iz = np.nonzero(seen)
+        if not ix.size:
+            return None
+        # The depth of a block's centre is linear in its indices: no points are made of them.
+        forward, eye = np.array(T_world_camera)[:3, 2], np.array(T_world_camera)[:3, 3]
+        edge_m = self.blocks.voxel_size_m
+        first = float(forward @ (np.array(self.blocks.origin_m) + 0.5 * edge_m - eye))
+        steps = (edge_m * forward).astype(np.float32)
+        return max(first + float((ix * steps[0] + iy * steps[1] + iz * steps[2]).max()), 0.0)
 
     def seen_by(self, unit_ids: Iterable[int]) -> NDArray[np.uint8]:
         """How many of these units look through each block, in the blocks' shape, uint8."""

@@ -7,8 +7,8 @@ Every call is handed the time; nothing here waits, reads a file or knows HTTP.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -55,7 +55,10 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class MapView:
-    """The merged map at one time: keys (N,) uint32 ascending, witnesses (N,) uint8; and whether it is all there is."""
+    """The merged map at one time: keys (N,) uint32 ascending, witnesses (N,) uint8; and whether it is all there is.
+
+    `reports` are the keys of each live unit by its id, of which it was merged.
+    """
 
     lattice: Lattice
     lattice_version: int
@@ -64,6 +67,7 @@ class MapView:
     reasons: tuple[str, ...]
     oldest_view_age_s: float | None
     units_live: int
+    reports: Mapping[int, NDArray[np.uint32]] = field(default_factory=dict)
 
     @property
     def complete(self) -> bool:
@@ -168,7 +172,12 @@ class Master:
 
     def units(self, now_ns: int) -> list[UnitRow]:
         """One row a unit."""
-        return [slot.row(now_ns, *self.judge(slot, now_ns)) for slot in self.registry]
+        rows = []
+        for slot in self.registry:
+            pose = slot.T_world_camera
+            range_m = None if pose is None else self.coverage.range_m(slot.id, pose)
+            rows.append(slot.row(now_ns, *self.judge(slot, now_ns), None if range_m is None else round(range_m, 2)))
+        return rows
 
     def unit_states(self, now_ns: int) -> list[dict[str, Any]]:
         """Of each row what a stream tells at every change: id, ip, state, reason, age and voxels."""
@@ -258,6 +267,7 @@ class Master:
             tuple(reasons),
             max(ages_s, default=None),
             len(ages_s),
+            self.map.reports(),
         )
 
     def seen_by(self, now_ns: int) -> NDArray[np.uint8]:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +33,7 @@ class MergedMap:
         self._keys: dict[int, NDArray[np.uint32]] = {}
         self._places: dict[int, NDArray[np.intp]] = {}
         self._snapshot: tuple[NDArray[np.uint32], NDArray[np.uint8]] | None = None
+        self._reports: dict[int, NDArray[np.uint32]] | None = None
 
     def replace(self, unit_id: int, keys: NDArray[np.uint32]) -> None:
         """From now on the unit reports `keys` (N,): ascending, each once, below the lattice's cell count."""
@@ -62,6 +65,13 @@ class MergedMap:
             self._snapshot = keys, self._witnesses[keys]
         return self._snapshot
 
+    def reports(self) -> Mapping[int, NDArray[np.uint32]]:
+        """What each unit reports, by its id."""
+        if self._reports is None:
+            self._reports = dict(self._keys)
+        return self._reports
+
     def _changed(self) -> None:
         self.revision += 1
         self._snapshot = None
+        self._reports = None

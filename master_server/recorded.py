@@ -243,6 +243,7 @@ class Recording:
                 state.reasons,
                 state.oldest_view_age_s,
                 state.units_live,
+                merged.reported(),
             )
             settings = _checked(Settings, raw.settings)
             return Frame(raw.log_ns, state, view, seen.blocks.lattice(), seen.counts(), settings)

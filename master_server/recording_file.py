@@ -197,6 +197,8 @@ def _same_map(a: Moment, b: Moment) -> bool:
         a.view.lattice_version == b.view.lattice_version
         and np.array_equal(a.view.keys, b.view.keys)
         and np.array_equal(a.view.witnesses, b.view.witnesses)
+        and a.view.reports.keys() == b.view.reports.keys()
+        and all(np.array_equal(keys, b.view.reports[unit_id]) for unit_id, keys in a.view.reports.items())
     )
 
 

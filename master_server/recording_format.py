@@ -115,12 +115,16 @@ class StateRecord(Record):
 
 
 class MapRecord(Record):
-    """The merged map: `keys` little-endian uint32, ascending; `witnesses` uint8, one each."""
+    """The merged map: `keys` little-endian uint32, ascending; `witnesses` uint8, one each.
+
+    `reports` are the keys of each live unit by its id; older recordings have none.
+    """
 
     lattice: LatticeDescription
     lattice_version: Counter
     keys: bytes
     witnesses: bytes
+    reports: dict[int, bytes] = {}
 
     @classmethod
     def of(cls, view: MapView) -> MapRecord:
@@ -130,6 +134,7 @@ class MapRecord(Record):
             lattice_version=view.lattice_version,
             keys=view.keys.astype("<u4", copy=False).tobytes(),
             witnesses=view.witnesses.tobytes(),
+            reports={unit_id: keys.astype("<u4", copy=False).tobytes() for unit_id, keys in view.reports.items()},
         )
 
     def arrays(self) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
@@ -141,6 +146,17 @@ class MapRecord(Record):
         if len(self.keys) != 4 * len(self.witnesses):
             raise InputError(f"map: expected 4 bytes a witness, got {len(self.keys)} and {len(self.witnesses)}")
         return np.frombuffer(self.keys, "<u4"), np.frombuffer(self.witnesses, np.uint8)
+
+    def reported(self) -> dict[int, NDArray[np.uint32]]:
+        """Keys (N,) of each unit.
+
+        Raises:
+            InputError: they are no whole number of keys.
+        """
+        for unit_id, keys in self.reports.items():
+            if len(keys) % 4:
+                raise InputError(f"map: expected 4 bytes a voxel of unit {unit_id}, got {len(keys)}")
+        return {unit_id: np.frombuffer(keys, "<u4") for unit_id, keys in self.reports.items()}
 
 
 class SeenRecord(Record):

@@ -249,7 +249,7 @@ class Slot:
             return "live", f"{self.warning}; {health.warning}" if health.warning else self.warning
         return "live", health.warning or ""
 
-    def row(self, now_ns: int, state: State, reason: str) -> UnitRow:
+    def row(self, now_ns: int, state: State, reason: str, range_m: float | None) -> UnitRow:
         """What `GET /units` tells."""
         self.expire(now_ns)
         age_s, arrival_age_s = self.age_s(now_ns), self.arrival_age_s(now_ns)
@@ -274,6 +274,8 @@ class Slot:
             T_world_camera=self.T_world_camera,
             pose_origin=self.record.pose_origin,
             pose_quality=self.record.pose_quality,
+            intrinsics=self.record.intrinsics,
+            range_m=range_m,
             versions=self.versions,
             last_command=self.last_command,
         )
@@ -480,6 +482,7 @@ def _registered(request: InitializeRequest, ip: str, before: UnitRecord | int, e
             "model": request.model,
             "software": request.software,
             "boot_id": request.boot_id,
+            "intrinsics": request.intrinsics,
         }
     )
 
@@ -488,7 +491,13 @@ def _expecting(left: UnitRecord, taken: UnitRecord, ip: str) -> UnitRecord:
     """The slot that a camera left for `ip`: the one that was there is expected here, without a pose."""
     note = f"camera {left.serial} is at {ip} now, where camera {taken.serial} was, which did not come back yet"
     return left.posed(None, None, note).model_copy(
-        update={"serial": taken.serial, "model": taken.model, "software": "", "boot_id": ""}
+        update={
+            "serial": taken.serial,
+            "model": taken.model,
+            "software": "",
+            "boot_id": "",
+            "intrinsics": taken.intrinsics,
+        }
     )
 
 

@@ -24,6 +24,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from shared.camera import Intrinsics
 from shared.cell import Cell
 from shared.configuration import sentence
 from shared.errors import CellError, ConfigError, Refusal
@@ -38,9 +39,12 @@ FILE_NAME = "master.db"
 APPLICATION_ID = 0x43574D53
 """In the file's header, so that a database of something else is never taken for ours."""
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
-UPGRADES = {1: "ALTER TABLE units ADD COLUMN pose_quality TEXT NOT NULL DEFAULT '{}'"}
+UPGRADES = {
+    1: "ALTER TABLE units ADD COLUMN pose_quality TEXT NOT NULL DEFAULT '{}'",
+    2: "ALTER TABLE units ADD COLUMN intrinsics TEXT",
+}
 """By version: what makes a store of it one of the next version."""
 
 LOCK_TIMEOUT_S = 3.0
@@ -64,7 +68,8 @@ CREATE TABLE units (
     pose_origin TEXT,
     pose_version INTEGER NOT NULL,
     note TEXT NOT NULL,
-    pose_quality TEXT NOT NULL
+    pose_quality TEXT NOT NULL,
+    intrinsics TEXT
 );
 CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE meshes (sha256 TEXT PRIMARY KEY, data BLOB NOT NULL);
@@ -87,6 +92,7 @@ class UnitRecord(Message):
     pose_version: Counter = 0
     note: str = ""
     pose_quality: PoseQuality = PoseQuality()
+    intrinsics: Intrinsics | None = None
 
     def posed(
         self,
@@ -240,6 +246,7 @@ class Store:
                 fields = dict(unit)
                 fields["T_world_camera"] = None if unit.T_world_camera is None else json.dumps(unit.T_world_camera)
                 fields["pose_quality"] = unit.pose_quality.model_dump_json(exclude_none=True)
+                fields["intrinsics"] = None if unit.intrinsics is None else unit.intrinsics.model_dump_json()
                 connection.execute(statement, tuple(fields.values()))
                 connection.execute(
                     "INSERT INTO facts VALUES ('last_id', ?) ON CONFLICT (name) DO UPDATE SET value = excluded.value "
@@ -375,9 +382,8 @@ def _damaged(path: Path | str, what: str) -> ConfigError:
 
 def _record(row: tuple[Any, ...]) -> UnitRecord:
     fields = dict(zip(UnitRecord.model_fields, row, strict=True))
-    pose = fields["T_world_camera"]
-    fields["T_world_camera"] = None if pose is None else json.loads(pose)
-    fields["pose_quality"] = json.loads(fields["pose_quality"])
+    for name in ("T_world_camera", "pose_quality", "intrinsics"):
+        fields[name] = None if fields[name] is None else json.loads(fields[name])
     return UnitRecord.model_validate(fields)
 
 

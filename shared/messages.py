@@ -350,6 +350,12 @@ class UnitRow(Message):
     T_world_camera: Matrix | None
     pose_origin: PoseOrigin | None = Field(default=None, description="Who said where the camera is.")
     pose_quality: PoseQuality = PoseQuality()
+    intrinsics: Intrinsics | None = Field(
+        default=None, description="Of its camera, as it told them when it registered; absent until it did."
+    )
+    range_m: float | None = Field(
+        default=None, description="How far before its camera the farthest block of the cell lies that it looks through."
+    )
     versions: Versions
     last_command: CommandRow | None = None
 

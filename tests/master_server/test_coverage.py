@@ -11,7 +11,8 @@ from master_server.coverage import MAX_BLOCKS, Coverage, blocks_of
 from shared.cell import Cell
 from shared.errors import WireError
 from shared.lattice import Lattice
-from shared.messages import SeenReport
+from shared.messages import SeenReport, matrix_of
+from shared.transforms import look_at
 from shared.wire import pack_seen
 
 BLOCKS = Lattice((0.0, 0.0, 0.0), 0.1, (5, 4, 3))
@@ -44,6 +45,19 @@ def test_nothing_is_seen_by_nobody() -> None:
     coverage.withdraw(1)
     assert not coverage.has(1)
     assert not coverage.seen_by([1]).any()
+
+
+def test_how_far_a_unit_looks_is_measured_along_its_axis() -> None:
+    coverage = Coverage(BLOCKS)
+    from_below, sideways = np.eye(4), look_at(np.array([-1.0, 0.2, 0.15]), np.array([0.0, 0.2, 0.15]))
+    assert coverage.range_m(1, matrix_of(from_below)) is None
+    seen = np.zeros(BLOCKS.shape, bool)
+    coverage.report(1, report(seen))
+    assert coverage.range_m(1, matrix_of(from_below)) is None
+    seen[0, 3, 0] = seen[3, 1, 1] = True
+    coverage.report(1, report(seen))
+    assert coverage.range_m(1, matrix_of(from_below)) == pytest.approx(0.15)
+    assert coverage.range_m(1, matrix_of(sideways)) == pytest.approx(1.35)
 
 
 def test_a_larger_block_stands_for_all_that_it_holds() -> None:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from master_server.master import Master
 from master_server.registry import COMMAND_EXPIRES_S, FPS_FRAMES, MAX_UNITS
+from shared.camera import Intrinsics
 from shared.cell import Cell
 from shared.errors import InputError, Refusal, WireError
 from shared.lattice import Lattice
@@ -636,3 +637,13 @@ def test_two_cameras_behind_one_address_do_not_take_turns() -> None:
     first.update(NOW_NS + 200 * MS, [6])
     assert shown(one, NOW_NS + 200 * MS) == {6: 1}
     assert one.units(NOW_NS)[0].serial == "S1"
+
+
+def test_a_row_tells_what_the_camera_is_and_how_far_it_looks() -> None:
+    one = master()
+    unit = joined(one, 1)
+    (row,) = one.units(NOW_NS)
+    assert (row.intrinsics, row.range_m) == (Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0), None)
+    unit.update(NOW_NS, [5], seen=sees_all(one))
+    # The highest block of a cell of half a metre, from its floor.
+    assert one.units(NOW_NS)[0].range_m == 0.45

@@ -63,6 +63,17 @@ def test_a_crowded_lattice_and_an_empty_one_are_united_alike() -> None:
         assert content(merged) == Counter([*range(0, 3 * reported, 3), *range(0, 2 * reported, 2)])
 
 
+def test_who_reports_what_is_known() -> None:
+    merged = MergedMap(LATTICE)
+    merged.replace(1, keys(1, 2))
+    merged.replace(2, keys(2))
+    before = merged.reports()
+    merged.replace(1, keys(7))
+    assert {unit_id: found.tolist() for unit_id, found in before.items()} == {1: [1, 2], 2: [2]}
+    merged.withdraw(2)
+    assert {unit_id: found.tolist() for unit_id, found in merged.reports().items()} == {1: [7]}
+
+
 def test_an_empty_map_has_no_voxels() -> None:
     assert content(MergedMap(LATTICE)) == {}
 

@@ -19,6 +19,7 @@ import pytest
 from master_server import store as store_module
 from master_server.master import Master
 from master_server.store import FILE_NAME, SCHEMA_VERSION, Store, UnitRecord
+from shared.camera import Intrinsics
 from shared.cell import Cell, PlacedMesh
 from shared.errors import ConfigError, Refusal
 from shared.meshes import box_mesh
@@ -93,6 +94,9 @@ def test_all_that_was_acknowledged_is_there_in_the_next_master(path: Path) -> No
         (ELSEWHERE, "board"),
     ]
     assert [row.pose_quality.uncertainty_mm for row in rows] == [None, 1.5]
+    assert [row.intrinsics for row in rows] == [Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)] * 2
+    # What was seen before is not seen now.
+    assert [row.range_m for row in rows] == [None, None]
     assert not two.view(NOW_NS).complete
     # An id is never given twice.
     assert joined(two, 4).initialized.id == 4
@@ -224,11 +228,13 @@ def test_a_store_of_an_older_master_becomes_one_of_this(path: Path) -> None:
     units = store.load().units
     store.close()
     older = sqlite3.connect(path)
-    older.executescript("ALTER TABLE units DROP COLUMN pose_quality; PRAGMA user_version = 1")
+    older.executescript(
+        "ALTER TABLE units DROP COLUMN pose_quality; ALTER TABLE units DROP COLUMN intrinsics; PRAGMA user_version = 1"
+    )
     older.close()
     for _ in range(2):
         with contextlib.closing(Store.open(path)) as opened:
-            assert opened.load().units == units
+            assert opened.load().units == tuple(unit.model_copy(update={"intrinsics": None}) for unit in units)
             assert opened._connection.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
 
 

@@ -22,11 +22,13 @@ In the order of the flow:
     answers      what readers are told of it
     stream       the map as it changes, for many listeners
     metrics      what a monitoring system reads
+    history      the last minutes in a few figures
     recording_format  what a recording holds, and a moment to be recorded
     foxglove     such a moment in the schemas that Foxglove shows
     recording_file    one file of a recording
     recording    files one after another, in a thread that nothing waits for
     recorded     a recording opened for reading
+    timeline     the files of one recording as one
     replay       a recording that answers as the master did
     config       the master's own configuration
     routes/      the same as HTTP

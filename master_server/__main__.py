@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`master-server --cell CELL.YAML`: serve one cell until told to stop.
 
-`master-server replay FILE` serves a recording in its place, `master-server recording-info FILE` tells what is in one,
+`master-server replay FILE...` serves a recording in its place, `master-server recording-info FILE...` tells what is in
+one,
 `master-server new-token unit` replaces a token.
 """
 
@@ -23,6 +24,8 @@ from pathlib import Path
 from typing import Any, get_args
 
 import uvicorn
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
 from master_server.access import Access, load_access
 from master_server.app import Application, add_viewer, make_app, make_replay_app
@@ -32,10 +35,10 @@ from master_server.limits import Limits
 from master_server.logs import LogFormat, LogLevel, configure
 from master_server.master import Master
 from master_server.readable import Readable
-from master_server.recorded import Progress, Recording, summary
 from master_server.recording import Recorder
 from master_server.replay import Replay
 from master_server.store import FILE_NAME, Store
+from master_server.timeline import Timeline, summary
 from master_server.tokens import Role, token_file, write_token
 from master_server.viewer.host import is_installed
 from master_server.viewer.proxy import PAGE, Gate, link_path
@@ -59,7 +62,7 @@ BACKLOG = 256
 
 LOGGING = ("log_level", "log_format")
 LISTENING = ("host", "port", "state_dir", "ready_file", "public_reads", "tls_certificate", "tls_key", *LOGGING)
-REPLAY_OPTIONS = ("file", "speed", "start_s", "loop", *LISTENING)
+REPLAY_OPTIONS = ("files", "speed", "start_s", "loop", *LISTENING)
 
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
@@ -176,16 +179,16 @@ def _serve_master(options: argparse.Namespace) -> None:
 def _serve_replay(options: argparse.Namespace) -> None:
     config = load(ReplayConfig, None, os.environ, ENVIRONMENT_PREFIX, _overrides(options, REPLAY_OPTIONS))
     configure(config.log_level, config.log_format)
-    with Recording(config.file, _progress(config.file)) as recording:
+    with _opened(config.files) as recording:
         if recording.trouble:
-            logger.warning("%s: %s", config.file, recording.trouble)
+            logger.warning("%s", recording.trouble)
         replay = Replay(recording, config.speed, config.start_s, config.loop)
         _serve(config, lambda access, limits: make_replay_app(replay, access, limits))
 
 
 def _tell_recording(options: argparse.Namespace) -> None:
     configure(options.log_level or "INFO", options.log_format or "text")
-    with Recording(options.file, _progress(options.file)) as recording:
+    with _opened(options.files) as recording:
         print("\n".join(summary(recording)))
 
 
@@ -194,17 +197,12 @@ def _replace_token(options: argparse.Namespace) -> None:
     print(f"master-server: the new token of the {options.role} lies in {path}; a master that runs on it takes it now")
 
 
-def _progress(file: Path) -> Progress | None:
-    """Tell a person how far the reading of a file is."""
-    if not sys.stderr.isatty():
-        return None
-
-    def tell(read: int, total: int) -> None:
-        print(f"\rmaster-server: reading {file.name}: {read / total:.0%}", end="", file=sys.stderr, flush=True)
-        if read >= total:
-            print(file=sys.stderr)
-
-    return tell
+def _opened(files: Sequence[Path]) -> Timeline:
+    """A recording; a person is told how far the reading is."""
+    columns = (TextColumn("reading"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task("reading", total=None)
+        return Timeline(files, lambda read, total: bar.update(task, completed=read, total=total))
 
 
 def _serve(
@@ -321,7 +319,9 @@ def _replay_parser() -> argparse.ArgumentParser:
         description="Serve a recording as if it were the master; pause and move in it.",
     )
     parser.set_defaults(run=_serve_replay)
-    parser.add_argument("file", type=Path, help="a recording (.mcap)")
+    parser.add_argument(
+        "files", type=Path, nargs="+", metavar="FILE", help="a recording (.mcap), or all files of one, in any order"
+    )
     parser.add_argument("--speed", type=float, help="1 is as it was")
     parser.add_argument("--from", dest="start_s", type=_seconds, metavar="TIME", help="begin there, as in 30s or 5m")
     parser.add_argument("--loop", action="store_true", default=None, help="begin anew at the end")
@@ -332,7 +332,9 @@ def _replay_parser() -> argparse.ArgumentParser:
 def _info_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="master-server recording-info", description="Tell what is in a recording.")
     parser.set_defaults(run=_tell_recording)
-    parser.add_argument("file", type=Path, help="a recording (.mcap)")
+    parser.add_argument(
+        "files", type=Path, nargs="+", metavar="FILE", help="a recording (.mcap), or all files of one, in any order"
+    )
     _add_log_options(parser)
     return parser
 

@@ -16,6 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from master_server.access import Access
 from master_server.cell_loading import CellLoader
 from master_server.description import describe, illustrate, serve_documentation
+from master_server.history import History
 from master_server.limits import Limits
 from master_server.master import Master
 from master_server.metrics import VERSION, Metrics
@@ -122,7 +123,9 @@ def make_replay_app(played: Replay, access: Access, limits: Limits | None = None
 def add_viewer(app: Application, actions: dict[str, str]) -> Gate:
     """Let operators see it under `/viewer/`; costs nothing while nobody looks."""
     state = app.state
-    state.viewer = gate = Gate(ViewerHost(app, state.master, state.access, actions), Sessions(state.access))
+    state.viewer = gate = Gate(
+        ViewerHost(app, state.master, state.history, state.access, actions), Sessions(state.access)
+    )
     app.include_router(proxy.router)
     return gate
 
@@ -137,13 +140,14 @@ def _assembled(
     *beside: Callable[[], Coroutine[None, None, None]],
 ) -> Application:
     listeners = Stream(master)
+    history = History(master)
 
     @asynccontextmanager
     async def running(app: FastAPI) -> AsyncIterator[None]:
         # Now, while nobody waits for it.
         app.openapi()
         listeners.start()
-        tasks = [asyncio.create_task(work()) for work in (access.follow, *beside)]
+        tasks = [asyncio.create_task(work()) for work in (access.follow, history.follow, *beside)]
         if recorder is not None and recorder.enabled:
             await recorder.begin()
         try:
@@ -175,6 +179,7 @@ def _assembled(
     app.state.access = access
     app.state.limits = limits or Limits()
     app.state.stream = listeners
+    app.state.history = history
     app.state.recorder = recorder
     app.state.viewer = None
     for router in routers:

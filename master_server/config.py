@@ -73,7 +73,7 @@ class MasterConfig(ServerConfig):
 class ReplayConfig(ServerConfig):
     """Of a recording that is served in place of a master."""
 
-    file: Path = Field(description="The recording.")
+    files: tuple[Path, ...] = Field(min_length=1, description="The files of one recording, in any order.")
     speed: float = Field(default=1.0, ge=SPEED_MIN, le=SPEED_MAX, description="Of the replay, 1 as it was.")
     start_s: float = Field(default=0.0, ge=0.0, description="Where in the recording it begins.")
     loop: bool = Field(default=False, description="Whether it begins anew at its end.")

@@ -15,7 +15,6 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from datetime import datetime, timezone
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
@@ -44,7 +43,6 @@ from master_server.recording_format import (
     cell_attachment,
     mesh_attachment,
 )
-from shared.clock import NS_PER_S
 from shared.configuration import sentence
 from shared.errors import InputError, SourceError
 from shared.lattice import Lattice
@@ -153,15 +151,17 @@ class Recording:
     @property
     def cells(self) -> list[dict[str, Any]]:
         """The documents of all cells that were watched."""
-        prefix = cell_attachment("")
-        names = [name for name in self._index.attachments if name.startswith(prefix)]
-        return [self.cell(name.removeprefix(prefix)) for name in names]
+        return [self.cell(sha256) for sha256 in self._attached(cell_attachment(""))]
 
     @property
     def meshes(self) -> list[str]:
         """The sha256 of all meshes."""
-        prefix = mesh_attachment("")
-        return [name.removeprefix(prefix) for name in self._index.attachments if name.startswith(prefix)]
+        return self._attached(mesh_attachment(""))
+
+    @property
+    def cell_names(self) -> list[str]:
+        """The sha256 of all cells."""
+        return self._attached(cell_attachment(""))
 
     def at(self, log_ns: int) -> Frame:
         """The last moment that is not after `log_ns`; the first one, if that is earlier."""
@@ -199,6 +199,15 @@ class Recording:
     def mesh(self, sha256: str) -> bytes | None:
         """A mesh in its canonical bytes, if it is there."""
         return self._attachment(mesh_attachment(sha256))
+
+    def forget(self) -> None:
+        """Let go of what was unpacked; it is unpacked again when it is asked for."""
+        self._unpacked.cache_clear()
+        self._parsed.cache_clear()
+
+    def _attached(self, prefix: str) -> list[str]:
+        names = self._index.attachments
+        return [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
 
     def _begin(self) -> None:
         index = self._index
@@ -326,33 +335,3 @@ def _begin_of(place: _Place) -> int:
 
 def _log_of(frame: _RawFrame) -> int:
     return frame.log_ns
-
-
-def duration_s(recording: Recording) -> float:
-    """Seconds from the first moment to the last."""
-    return (recording.end_ns - recording.begin_ns) / NS_PER_S
-
-
-def summary(recording: Recording) -> list[str]:
-    """What is in a recording, in lines for a person."""
-    first, last = recording.at(recording.begin_ns), recording.at(recording.end_ns)
-    lines = [
-        f"{recording.path}: {recording.size_bytes / 1e6:.1f} MB",
-        f"  from      {_utc(recording.begin_ns)}",
-        f"  to        {_utc(recording.end_ns)} ({duration_s(recording):.1f} s)",
-        f"  trouble   {recording.trouble or 'none'}",
-    ]
-    for cell in recording.cells:
-        low, high = (" ".join(f"{value:g}" for value in cell[key]) for key in ("box_min_m", "box_max_m"))
-        lines.append(f"  cell      {cell['name']}: {low} to {high} m")
-    for name, frame in (("begins", first), ("ends", last)):
-        units = ", ".join(f"{row.id} {row.state}" for row in frame.state.units) or "none"
-        lines.append(
-            f"  {name:9s} voxels of {frame.view.lattice.voxel_size_m:g} m: {len(frame.view.keys)}, "
-            f"{'complete' if frame.view.complete else 'not complete'}; units: {units}"
-        )
-    return lines + [f"  {topic:21s} {count}" for topic, count in sorted(recording.counts.items())]
-
-
-def _utc(log_ns: int) -> str:
-    return datetime.fromtimestamp(log_ns / NS_PER_S, timezone.utc).isoformat(sep=" ", timespec="milliseconds")

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from master_server.master import MapView
-from master_server.recorded import Frame, Recording, duration_s
+from master_server.recorded import Frame
+from master_server.timeline import Timeline, duration_s
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import Refusal, SourceError
 from shared.lattice import Lattice
@@ -41,7 +42,8 @@ class ReplayRequest(BaseModel):
 class ReplayAnswer(BaseModel):
     """How the replay stands."""
 
-    file: str
+    file: str = Field(description="The file that is shown now.")
+    files: int = Field(description="How many files follow one another.")
     position_s: float
     duration_s: float
     speed: float
@@ -68,7 +70,7 @@ class Replay:
 
     def __init__(
         self,
-        recording: Recording,
+        recording: Timeline,
         speed: float = 1.0,
         start_s: float = 0.0,
         loop: bool = False,
@@ -143,14 +145,16 @@ class Replay:
 
     def answer(self, now_ns: int) -> ReplayAnswer:
         """How it stands."""
+        frame = self._frame(now_ns)
         return ReplayAnswer(
             file=self._recording.path.name,
+            files=len(self._recording.files),
             position_s=round(self._position_ns(now_ns) / NS_PER_S, 4),
             duration_s=round(duration_s(self._recording), 4),
             speed=self._speed,
             playing=self._is_moving(now_ns),
             loop=self._loop,
-            recorded_at_ns=self._frame(now_ns).log_ns,
+            recorded_at_ns=frame.log_ns,
             trouble=self._recording.trouble,
         )
 
@@ -206,7 +210,7 @@ class Replay:
 class _Meshes(Mapping[str, bytes]):
     """The meshes of a recording, each read when it is asked for."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Timeline) -> None:
         self._recording = recording
 
     def __getitem__(self, sha256: str) -> bytes:

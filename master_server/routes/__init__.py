@@ -9,7 +9,7 @@ In the order of the flow:
     units     registering, and what is known of each unit
     images    a unit's pictures, on request
     cell      the cell's document and meshes
-    map       the merged map, the coverage and the settings
+    map       the merged map, the coverage, the history and the settings
     stream    the merged map as it changes
     robot     the robot's joints
     recording  recording what the master sees

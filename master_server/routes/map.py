@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The merged map, how much of the cell is seen, and the settings that shape both."""
+"""The merged map, how much of the cell is seen, how both were of late, and the settings that shape them."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from master_server.answers import (
     map_fields,
     unseen_fields,
 )
+from master_server.history import History, HistoryAnswer
 from master_server.routes.common import (
     OPERATOR_ONLY,
     READERS,
@@ -53,6 +54,14 @@ async def coverage(
 ) -> Response:
     """How much of the cell live units look through now; what none does is unseen, not free."""
     return _packed(request, coverage_fields(master, blocks, monotonic_ns()))
+
+
+@router.get("/history", dependencies=READERS)
+async def history(request: Request) -> HistoryAnswer:
+    """The last five minutes, one sample a second: the scene refresh time, voxels, live units."""
+    kept = request.app.state.history
+    assert isinstance(kept, History)
+    return kept.answer(monotonic_ns())
 
 
 @router.get("/settings", dependencies=READERS)

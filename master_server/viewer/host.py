@@ -20,10 +20,11 @@ import httpx
 from starlette.types import ASGIApp
 
 from master_server.access import Access
+from master_server.history import History
 from master_server.readable import Readable
 from master_server.replay import Replay
 from master_server.viewer.channel import pack, receive
-from master_server.viewer.look import look
+from master_server.viewer.look import Wanted, look
 from master_server.viewer.sessions import Viewer
 from shared.clock import monotonic_ns
 from shared.errors import Refusal, WireError
@@ -53,10 +54,13 @@ def is_installed() -> bool:
 class ViewerHost:
     """One viewer process at most, and what it asks."""
 
-    def __init__(self, app: ASGIApp, master: Readable, access: Access, actions: dict[str, str]) -> None:
+    def __init__(
+        self, app: ASGIApp, master: Readable, history: History, access: Access, actions: dict[str, str]
+    ) -> None:
         """`actions` of an operator on a unit: what a button says, and the address that it posts to."""
         self._app = app
         self._master = master
+        self._history = history
         self._access = access
         self._actions = actions
         self._starting = asyncio.Lock()
@@ -151,7 +155,7 @@ class ViewerHost:
 
     def _look(self, message: dict[str, Any]) -> dict[str, Any]:
         try:
-            return look(self._master, message["units"], message["unseen"], monotonic_ns())
+            return look(self._master, self._history, Wanted(**message["wanted"]), monotonic_ns())
         except Refusal as refusal:
             # A recording may be damaged in its middle.
             return {"refused": str(refusal)}

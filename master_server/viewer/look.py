@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from master_server.history import History
 from master_server.readable import Readable
 from master_server.replay import Replay
 from shared.lattice import Lattice
@@ -16,8 +17,24 @@ REASONS_MAX = 8
 """Why the map is not complete: what fits beside it; one for each of 64 units does not."""
 
 
-def look(master: Readable, with_units: bool, with_unseen: bool, now_ns: int) -> dict[str, Any]:
-    """The map and the robot as plain values; units, and what nobody sees, only where asked for."""
+class Wanted(NamedTuple):
+    """What is asked for besides the map and the robot: it costs the master time or changes rarely.
+
+    Attributes:
+        units: their rows, and how things stood after `since_ns`.
+        unseen: what nobody sees.
+        reports: which unit reports which voxels.
+        since_ns: the newest sample of the history that is known.
+    """
+
+    units: bool = False
+    unseen: bool = False
+    reports: bool = False
+    since_ns: int = -1
+
+
+def look(master: Readable, history: History, wanted: Wanted, now_ns: int) -> dict[str, Any]:
+    """The map and the robot as plain values, and what else is wanted."""
     view = master.view(now_ns)
     robot = master.robot_answer(None, now_ns)
     told: dict[str, Any] = {
@@ -32,9 +49,12 @@ def look(master: Readable, with_units: bool, with_unseen: bool, now_ns: int) -> 
         "robot": {"state": robot.state, "reason": robot.reason},
         "joints": robot.joints[-1].positions if robot.joints else None,
     }
-    if with_units:
+    if wanted.units:
         told["units"] = [row.model_dump() for row in master.units(now_ns)]
-    if with_unseen:
+        told["now_ns"], told["history"] = now_ns, history.since(wanted.since_ns)
+    if wanted.reports:
+        told["reports"] = {unit_id: keys.tobytes() for unit_id, keys in view.reports.items()}
+    if wanted.unseen:
         seen = master.seen_by(now_ns) > 0
         told["seen"] = np.packbits(seen).tobytes()
         told["blocks"] = _described(master.blocks_at(now_ns))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import html
 import io
 import json
+import re
 from collections import deque
 from collections.abc import Callable
 from functools import partial
@@ -18,14 +19,23 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from master_server.history import SAMPLES_MAX, Sample
 from master_server.viewer.channel import Asker
-from master_server.viewer.scene import STATE_COLOURS, UnseenLayer
+from master_server.viewer.scene import (
+    SHARED_COLOUR,
+    STATE_COLOURS,
+    WITNESS_COLOURS,
+    Colour,
+    RangeLayer,
+    UnseenLayer,
+    VoxelLayer,
+    Voxels,
+    unit_colour,
+)
 from master_server.viewer.sessions import Viewer
+from shared.clock import NS_PER_S
 from shared.errors import CellwatchError, Refusal
 from shared.lattice import Lattice
-
-HISTORY = 600
-"""Points of the plots: five minutes at two a second."""
 
 ACTION_S = 5.0
 """For what an operator's own action posts to."""
@@ -40,7 +50,8 @@ STYLE = """<style>
 .cw th{font-weight:600;text-align:right;opacity:.65}.cw td{text-align:right;padding:.1em .2em}
 .cw th:first-child,.cw td:first-child,.cw th:nth-child(2),.cw td:nth-child(2){text-align:left}
 .cw td{white-space:nowrap}.cw td.why{white-space:normal;text-align:left;opacity:.8;padding-bottom:.4em}
-.cw b{font-weight:600}
+.cw b{font-weight:600}.cw i{display:inline-block;width:.8em;height:.8em;border-radius:2px;margin:0 .3em 0 .8em}
+.cw i:first-child{margin-left:0}.cw progress{width:100%;height:.6em;accent-color:#2f6fd0}
 </style>"""
 
 PICTURES = ("depth", "expected", "foreground")
@@ -53,13 +64,30 @@ SETTINGS = (
 """Name, label, least, most and step; the other settings are for `PUT /settings`."""
 
 COMMANDS = (
-    ("Find by the board", "POST", "/calibrate"),
-    ("Refine the pose", "POST", "/refine"),
-    ("Learn the background", "POST", "/background"),
-    ("Drop the background", "DELETE", "/background"),
-    ("Forget this unit", "DELETE", ""),
+    ("Find by the board", "POST", "/calibrate", ""),
+    ("Refine the pose", "POST", "/refine", ""),
+    ("Learn the background", "POST", "/background", ""),
+    (
+        "Drop the background",
+        "DELETE",
+        "/background",
+        "What it learned of the empty cell is lost; to learn it again, the cell must be empty.",
+    ),
+    (
+        "Forget this unit",
+        "DELETE",
+        "",
+        "Its slot and its camera's pose are deleted, and the map no longer waits for it. If it still runs it comes "
+        "back as a new unit without a pose.",
+    ),
 )
-"""What a button says, and what it asks of `/units/ID`."""
+"""What a button says, what it asks of `/units/ID`, and what is lost by it: then it asks once more."""
+
+COLOURINGS = BY_WITNESSES, BY_UNIT = "number of units", "unit"
+"""What the colours of voxels may tell."""
+
+LEARNING = re.compile(r"learning the background: frame (\d+) of (\d+)")
+"""What a unit says while it learns, as its reason not to be live."""
 
 
 def status_html(told: dict[str, Any]) -> str:
@@ -70,12 +98,13 @@ def status_html(told: dict[str, Any]) -> str:
         state = "playing" if replayed["playing"] else "paused"
         lines.append(
             f"<b>recording</b> {html.escape(replayed['file'])}, {replayed['position_s']:.1f} of "
-            f"{replayed['duration_s']:.1f} s, {state}"
+            f"{replayed['duration_s']:.1f} s{_of_files(replayed['files'])}, {state}"
         )
     voxels = len(told["keys"]) // 4
     age_s = told["oldest_view_age_s"]
     age = "" if age_s is None else f", oldest view {age_s * 1000:.0f} ms"
-    lines.append(f"<b>{voxels}</b> obstacle voxels, {told['units_live']} units live{age}")
+    units = f"{told['units_live']} unit{'' if told['units_live'] == 1 else 's'} live"
+    lines.append(f"<b>{voxels}</b> obstacle voxels, {units}{age}")
     if told["reasons"]:
         colour = _css("blind")
         lines.append(f'<b style="color:{colour}">The map is not complete:</b>')
@@ -112,21 +141,63 @@ def table_html(rows: list[dict[str, Any]]) -> str:
         if command := row["last_command"]:
             notes.append(f"{command['verb']}: {command['outcome'] or 'under way'}")
         if notes:
-            parts.append(f'<tr><td class="why" colspan="8">{html.escape("; ".join(notes))}</td></tr>')
+            bar = _progress_html(row["reason"])
+            parts.append(f'<tr><td class="why" colspan="8">{html.escape("; ".join(notes))}{bar}</td></tr>')
     if not rows:
         parts.append('<tr><td class="why" colspan="8">No unit has registered yet.</td></tr>')
     return f'{STYLE}<div class="cw" data-cellwatch="units"><table>{"".join(parts)}</table></div>'
+
+
+def legend_html(by_unit: bool, rows: list[dict[str, Any]], is_told: bool) -> str:
+    """What the colours of voxels tell; `is_told` is whether who reports them is known at all."""
+    entries: list[tuple[Colour, str]]
+    if not by_unit:
+        counts = ("1 unit", "2 units", f"{len(WITNESS_COLOURS)} or more")
+        entries = list(zip(WITNESS_COLOURS, counts, strict=True))
+    elif is_told:
+        entries = [(unit_colour(row["id"]), f"unit {row['id']}") for row in rows] + [(SHARED_COLOUR, "several units")]
+    else:
+        entries = [(SHARED_COLOUR, "not recorded: this recording tells how many units report a voxel, not which")]
+    chips = "".join(
+        f'<span style="white-space:nowrap"><i style="background:rgb{colour}"></i>{text}</span> '
+        for colour, text in entries
+    )
+    return f'{STYLE}<div class="cw" data-cellwatch="legend">{chips}</div>'
+
+
+def confirm_html(row: dict[str, Any], loss: str) -> str:
+    """Of which unit something would be lost, and what."""
+    unit = html.escape(f"unit {row['id']} · {row['ip']}, camera {row['serial']}")
+    return f'{STYLE}<div class="cw" data-cellwatch="confirm" style="padding-bottom:.8em"><b>{unit}</b><br>{loss}</div>'
+
+
+def _of_files(count: int) -> str:
+    return f" in {count} files" if count > 1 else ""
+
+
+def _progress_html(reason: str) -> str:
+    """How far a unit is that learns; empty for all others."""
+    found = LEARNING.search(reason)
+    if found is None:
+        return ""
+    return f'<progress value="{int(found[1])}" max="{int(found[2])}"></progress>'
 
 
 def _css(state: str) -> str:
     return "rgb({}, {}, {})".format(*STATE_COLOURS[state])
 
 
+def _curve(points: list[tuple[int, float]], offset_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times (N,) in seconds and values (N,) to be plotted; `offset_s` is added to the times, which are nanoseconds."""
+    at_ns, values = np.array(points or [(0, 0.0)], np.float64).T
+    return at_ns / NS_PER_S + offset_s, values
+
+
 class Panel:
     """What all who look see alike beside the picture."""
 
     def __init__(self, server: viser.ViserServer) -> None:
-        self._history: deque[tuple[float, float, float]] = deque(maxlen=HISTORY)
+        self._history: deque[Sample] = deque(maxlen=SAMPLES_MAX)
         gui = server.gui
         gui.configure_theme(
             show_logo=False, show_share_button=False, control_layout="collapsible", control_width="large"
@@ -135,19 +206,28 @@ class Panel:
         self._status = gui.add_html("", order=0.0)
         with gui.add_folder("Units", order=1.0):
             self._table = gui.add_html("")
-        with gui.add_folder("The last minutes", order=5.0):
-            self._age = self._plot(gui, "age of the oldest view [ms]", "#2f6fd0")
+        with gui.add_folder("The last minutes", order=2.6):
+            self._age = self._plot(gui, "scene refresh: age of the oldest view [ms]", "#2f6fd0")
             self._voxels = self._plot(gui, "obstacle voxels", "#e65a1e")
 
-    def show(self, told: dict[str, Any], at_s: float) -> None:
+    @property
+    def known_ns(self) -> int:
+        """When the newest sample of the history was taken that is shown."""
+        return self._history[-1].at_ns if self._history else -1
+
+    def show(self, told: dict[str, Any], wall_s: float) -> None:
         """The newest, with units."""
-        age_s = told["oldest_view_age_s"]
-        self._history.append((at_s, np.nan if age_s is None else age_s * 1000.0, len(told["keys"]) / 4.0))
         self._status.content = status_html(told)
         self._table.content = table_html(told["units"])
-        times_s, ages_ms, voxels = np.array(self._history, np.float64).T
-        self._age.data = (times_s, ages_ms)
-        self._voxels.data = (times_s, voxels)
+        samples = [Sample(*values) for values in told["history"]]
+        if not samples:
+            return
+        self._history.extend(samples)
+        offset_s = wall_s - told["now_ns"] / NS_PER_S
+        self._voxels.data = _curve([(sample.at_ns, float(sample.voxels)) for sample in self._history], offset_s)
+        # A gap cannot be drawn: one value that is no number, and nothing of the curve is.
+        ages_s = [(sample.at_ns, sample.oldest_view_age_s) for sample in self._history]
+        self._age.data = _curve([(at_ns, 1000.0 * age_s) for at_ns, age_s in ages_s if age_s is not None], offset_s)
 
     def say(self, text: str) -> None:
         """Something stands in place of the status."""
@@ -182,11 +262,16 @@ class Person:
         self._asker = asker
         self._units: dict[str, dict[str, Any]] = {}
         self._unseen = UnseenLayer(client)
+        self._ranges = RangeLayer(client)
+        self._voxels = VoxelLayer(client)
         self._position: Any = None
         self._playing: Any = None
         self.wanted_position_s: float | None = None
         gui = client.gui
         with gui.add_folder("Look", order=2.0):
+            self._colouring = gui.add_dropdown("voxels by", COLOURINGS)
+            self._legend = gui.add_html("")
+            self._wants_ranges = gui.add_checkbox("how far cameras see", True)
             self._wants_unseen = gui.add_checkbox("space that nobody sees", False)
             self._unit = gui.add_dropdown("unit", ("none",))
             if not is_replay:
@@ -195,7 +280,7 @@ class Person:
         if viewer is Viewer.OPERATOR and is_replay:
             self._add_player(gui)
         elif viewer is Viewer.OPERATOR:
-            self._add_controls(gui, actions)
+            self._do(partial(self._add_controls, gui, actions))
         elif not is_replay:
             gui.add_markdown("You entered as a reader: to change something, enter as the operator.", order=3.0)
 
@@ -204,12 +289,27 @@ class Person:
         """Whether they want to see what nobody sees."""
         return bool(self._wants_unseen.value)
 
+    @property
+    def wants_by_unit(self) -> bool:
+        """Whether colours are to tell them which unit reports a voxel."""
+        return bool(self._colouring.value == BY_UNIT)
+
+    def draw(self, voxels: Voxels) -> None:
+        """Obstacles, in the colours that they want."""
+        self._voxels.show(voxels, self.wants_by_unit)
+
     def show(self, told: dict[str, Any]) -> None:
         """The newest, with units."""
         units = {f"{row['id']} · {row['ip']}": row for row in told["units"]}
         if units.keys() != self._units.keys():
             self._unit.options = tuple(units) or ("none",)
         self._units = units
+        is_told = not told["keys"] or told.get("reports") != {}
+        self._legend.content = legend_html(self.wants_by_unit, told["units"], is_told)
+        if self._wants_ranges.value:
+            self._ranges.show(told["units"])
+        else:
+            self._ranges.hide()
         if self.wants_unseen and "seen" in told:
             self._unseen.show(told["seen"], lattice_of(told["blocks"]))
         elif not self.wants_unseen:
@@ -232,9 +332,10 @@ class Person:
         with gui.add_folder("This unit", order=3.0):
             for label, url in actions.items():
                 self._on_click(gui.add_button(label, color="orange"), partial(self._act, url))
-            for label, method, path in COMMANDS:
-                colour: Any = "red" if label.startswith("Forget") else "gray"
-                self._on_click(gui.add_button(label, color=colour), partial(self._command, method, path))
+            for label, method, path, loss in COMMANDS:
+                colour: Any = "red" if loss else "gray"
+                do = partial(self._confirm, label, loss, method, path) if loss else partial(self._command, method, path)
+                self._on_click(gui.add_button(label, color=colour), do)
         settings = self._ask("GET", "/settings")
         with gui.add_folder("Settings", order=4.0):
             numbers: dict[str, Any] = {
@@ -278,6 +379,23 @@ class Person:
 
     def _command(self, method: str, path: str) -> None:
         self._ask(method, f"/units/{self._chosen()['id']}{path}")
+
+    def _confirm(self, label: str, loss: str, method: str, path: str) -> None:
+        """Ask once more, of the unit that is chosen now."""
+        row = self._chosen()
+        gui = self.client.gui
+        modal = gui.add_modal(f"{label}?")
+        with modal:
+            gui.add_html(confirm_html(row, loss))
+            sure = gui.add_button(f"{label.split()[0]} it", color="red")
+            back = gui.add_button("Keep it", color="gray")
+
+        def act() -> None:
+            modal.close()
+            self._ask(method, f"/units/{row['id']}{path}")
+
+        self._on_click(sure, act)
+        self._on_click(back, modal.close)
 
     def _do(self, do: Callable[[], Any]) -> None:
         try:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,10 +12,13 @@ import viser
 from numpy.typing import NDArray
 from viser.transforms import SO3
 
+from shared.camera import Intrinsics
 from shared.cell import Cell, PlacedMesh
 from shared.lattice import Lattice
 
-STATE_COLOURS: dict[str, tuple[int, int, int]] = {
+Colour = tuple[int, int, int]
+
+STATE_COLOURS: dict[str, Colour] = {
     "live": (40, 160, 70),
     "stale": (225, 150, 0),
     "blind": (205, 40, 40),
@@ -26,8 +31,23 @@ BOX_COLOUR = (60, 60, 60)
 UNSEEN_COLOUR = (110, 80, 150)
 UNSEEN_OPACITY = 0.16
 
-WITNESS_COLOURS = np.array([(222, 40, 3), (174, 7, 4), (78, 1, 11)], np.uint8)
-"""Of voxels that one unit reports, two, and more; viser takes them to be linear: orange, red and crimson."""
+WITNESS_COLOURS: tuple[Colour, ...] = ((240, 110, 28), (214, 46, 33), (150, 13, 59))
+"""Of voxels that one unit reports, two, and more: orange, red and crimson."""
+
+UNIT_COLOURS: tuple[Colour, ...] = (
+    (240, 110, 28),
+    (0, 165, 125),
+    (215, 70, 170),
+    (235, 200, 40),
+    (110, 80, 205),
+    (50, 170, 225),
+    (140, 80, 40),
+    (125, 185, 40),
+)
+"""Of voxels that one unit alone reports, by its id; they begin anew after the last."""
+
+SHARED_COLOUR: Colour = (85, 85, 85)
+"""Of voxels that several units report, where colours tell the unit; and where nobody knows which one it was."""
 
 VOXEL_SHARE = 0.92
 """Of a voxel's edge that is drawn, so that one can tell them apart."""
@@ -35,10 +55,13 @@ VOXEL_SHARE = 0.92
 VOXELS_MAX = 20_000
 """Beyond, every second or third is drawn: browsers of control rooms draw no more in time."""
 
-FOV_RAD, ASPECT = 1.02, 16.0 / 9.0
-"""Of a D435's depth, vertically; no unit tells the master its own."""
+FRUSTUM_M = 0.18
+"""How far before a camera the base of its pyramid is drawn."""
 
-FRUSTUM_M = 0.22
+FRUSTUM_LINE_M, RANGE_LINE_PX = 0.015, 1.5
+
+RANGE_SHADE = 0.55
+"""Of the colour of a camera's state, for the lines that show how far it looks; the rest is white."""
 
 BOX_EDGES = np.array(
     [(a, b) for a in range(8) for b in range(8) if a < b and bin(a ^ b).count("1") == 1], dtype=np.int64
@@ -55,6 +78,42 @@ VIEW_FOV_RAD = 0.8
 """Of who looks, vertically."""
 
 Points = NDArray[np.float32]
+
+
+PYRAMID = np.array([(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)])
+"""Edges of a view: from the eye, which comes first, to the picture's corners, and between these."""
+
+
+def linear(colours: Sequence[Colour]) -> NDArray[np.uint8]:
+    """Colours (N, 3) of a screen as viser wants those of many bodies: in proportion to light."""
+    share = np.asarray(colours, np.float64) / 255.0
+    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return np.rint(light * 255.0).astype(np.uint8)
+
+
+def unit_colour(unit_id: int) -> Colour:
+    """Of what one unit alone reports."""
+    return UNIT_COLOURS[(unit_id - 1) % len(UNIT_COLOURS)]
+
+
+def owners(keys: NDArray[np.uint32], reports: Mapping[int, NDArray[np.uint32]]) -> NDArray[np.int64]:
+    """The id of the one unit that reports each of the `keys` (N,), 0 where none or several do."""
+    found = np.zeros(len(keys), np.int64)
+    counts = np.zeros(len(keys), np.int64)
+    for unit_id, reported in reports.items():
+        is_theirs = np.isin(keys, reported, assume_unique=True)
+        found[is_theirs] = unit_id
+        counts += is_theirs
+    return np.where(counts == 1, found, 0)
+
+
+def view_edges(intrinsics: Intrinsics, depth_m: float) -> Points:
+    """What a camera looks through down to `depth_m`, as line segments (8, 2, 3) in its own frame."""
+    right, bottom = intrinsics.width - 0.5, intrinsics.height - 0.5
+    corners = np.array([(-0.5, -0.5), (right, -0.5), (right, bottom), (-0.5, bottom)])
+    rays = (corners - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy)
+    points = np.vstack((np.zeros(3), np.column_stack((rays, np.ones(4))) * depth_m))
+    return np.asarray(points[PYRAMID], np.float32)
 
 
 def wxyz_of(T: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -109,10 +168,8 @@ class Scene:
         self._cell: Cell | None = None
         self._parts: list[Any] = []
         self._links: list[Any] = []
-        self._cameras: dict[int, tuple[Any, Any]] = {}
+        self._cameras: dict[int, tuple[Any, ...]] = {}
         self._told: dict[int, tuple[object, ...]] = {}
-        self._voxels: Any = None
-        self._voxel_size_m = 0.0
         self._joints: tuple[float, ...] | None = None
         server.scene.set_up_direction("+z")
 
@@ -172,46 +229,19 @@ class Scene:
                 link.visible = True
 
     def set_units(self, rows: list[dict[str, Any]]) -> None:
-        """A frustum a unit whose pose is known, in the colour of its state."""
+        """A pyramid a unit whose pose is known, in the colour of its state."""
         posed = {row["id"]: row for row in rows if row["T_world_camera"] is not None}
         for unit_id in self._cameras.keys() - posed.keys():
             for part in self._cameras.pop(unit_id):
                 part.remove()
             self._told.pop(unit_id, None)
         for unit_id, row in posed.items():
-            told = (row["state"], row["T_world_camera"])
+            told = (row["state"], row["T_world_camera"], row["intrinsics"])
             if self._told.get(unit_id) != told:
                 self._told[unit_id] = told
                 self._draw_camera(unit_id, row)
 
-    def set_voxels(self, lattice: Lattice, keys: NDArray[np.uint32], witnesses: NDArray[np.uint8]) -> None:
-        """Obstacles, in the colour of how many units report each."""
-        stride = -(-max(len(keys), 1) // VOXELS_MAX)
-        centres = lattice.centres(lattice.indices(keys[::stride])).astype(np.float32)
-        colours = WITNESS_COLOURS[np.clip(witnesses[::stride].astype(np.int64) - 1, 0, 2)]
-        turns = np.tile(NO_TURN, (len(centres), 1))
-        if self._voxels is None or self._voxel_size_m != lattice.voxel_size_m:
-            self._voxel_size_m = lattice.voxel_size_m
-            vertices, faces = cube(lattice.voxel_size_m * VOXEL_SHARE)
-            self._voxels = self._server.scene.add_batched_meshes_simple(
-                "/obstacles",
-                vertices,
-                faces,
-                batched_wxyzs=turns,
-                batched_positions=centres,
-                batched_colors=colours,
-                lod="off",
-                flat_shading=True,
-                cast_shadow=False,
-                receive_shadow=False,
-            )
-            return
-        with self._server.atomic():
-            self._voxels.batched_wxyzs = turns
-            self._voxels.batched_positions = centres
-            self._voxels.batched_colors = colours
-
-    def _body(self, name: str, body: PlacedMesh, colour: tuple[int, int, int]) -> Any:
+    def _body(self, name: str, body: PlacedMesh, colour: Colour) -> Any:
         return self._server.scene.add_mesh_simple(
             name,
             body.mesh.vertices,
@@ -229,19 +259,133 @@ class Scene:
         for part in self._cameras.pop(unit_id, ()):
             part.remove()
         text = f"{unit_id}" if state == "live" else f"{unit_id} {state}"
-        self._cameras[unit_id] = (
-            self._server.scene.add_camera_frustum(
-                f"/cameras/{unit_id}",
-                fov=FOV_RAD,
-                aspect=ASPECT,
-                scale=FRUSTUM_M,
-                thickness=0.015,
-                color=STATE_COLOURS[state],
+        label = self._server.scene.add_label(
+            f"/labels/{unit_id}", text, position=pose[:3, 3] + (0.0, 0.0, 0.15), anchor="bottom-center"
+        )
+        if row["intrinsics"] is None:
+            # A recording of before units' intrinsics were kept: where it is, and not what it looks at.
+            self._cameras[unit_id] = (label,)
+            return
+        pyramid = self._server.scene.add_line_segments(
+            f"/cameras/{unit_id}",
+            view_edges(Intrinsics(**row["intrinsics"]), FRUSTUM_M),
+            STATE_COLOURS[state],
+            thickness=FRUSTUM_LINE_M,
+            wxyz=wxyz_of(pose),
+            position=pose[:3, 3],
+        )
+        self._cameras[unit_id] = (pyramid, label)
+
+
+@dataclass(frozen=True, eq=False)
+class Voxels:
+    """Obstacles at one time, as they are drawn: at most `VOXELS_MAX` of them."""
+
+    size_m: float
+    centres: Points
+    witnesses: NDArray[np.uint8]
+    owners: NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls,
+        lattice: Lattice,
+        keys: NDArray[np.uint32],
+        witnesses: NDArray[np.uint8],
+        reports: Mapping[int, NDArray[np.uint32]],
+    ) -> Voxels:
+        """Those of a map; `reports` are the units' own, by their id."""
+        stride = -(-max(len(keys), 1) // VOXELS_MAX)
+        keys = keys[::stride]
+        centres = lattice.centres(lattice.indices(keys)).astype(np.float32)
+        return cls(lattice.voxel_size_m, centres, witnesses[::stride], owners(keys, reports))
+
+    def colours(self, by_unit: bool) -> NDArray[np.uint8]:
+        """One (N, 3) each, as viser wants them: by the number of units that report it, or by the one that does."""
+        if not by_unit:
+            return linear(WITNESS_COLOURS)[np.clip(self.witnesses.astype(np.int64) - 1, 0, len(WITNESS_COLOURS) - 1)]
+        found = np.tile(linear([SHARED_COLOUR]), (len(self.owners), 1))
+        for unit_id in np.unique(self.owners[self.owners > 0]).tolist():
+            found[self.owners == unit_id] = linear([unit_colour(unit_id)])
+        return found
+
+
+class VoxelLayer:
+    """Obstacles, for one who wants them in colours of their own choice."""
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        self._client = client
+        self._part: Any = None
+        self._drawn: tuple[Voxels, bool] | None = None
+
+    def show(self, voxels: Voxels, by_unit: bool) -> None:
+        """Draw them."""
+        if self._drawn == (voxels, by_unit):
+            return
+        before, self._drawn = self._drawn, (voxels, by_unit)
+        turns = np.tile(NO_TURN, (len(voxels.centres), 1))
+        colours = voxels.colours(by_unit)
+        if before is None or before[0].size_m != voxels.size_m:
+            vertices, faces = cube(voxels.size_m * VOXEL_SHARE)
+            self._part = self._client.scene.add_batched_meshes_simple(
+                "/obstacles",
+                vertices,
+                faces,
+                batched_wxyzs=turns,
+                batched_positions=voxels.centres,
+                batched_colors=colours,
+                lod="off",
+                flat_shading=True,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            return
+        with self._client.atomic():
+            self._part.batched_wxyzs = turns
+            self._part.batched_positions = voxels.centres
+            self._part.batched_colors = colours
+
+
+class RangeLayer:
+    """How far each live camera looks now, for one who wants to see it."""
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        self._client = client
+        self._parts: dict[int, Any] = {}
+        self._drawn: dict[int, tuple[object, ...]] = {}
+
+    def show(self, rows: list[dict[str, Any]]) -> None:
+        """Draw it: what each camera looks through, down to the farthest block that it sees."""
+        shown = {row["id"]: row for row in rows if _has_range(row)}
+        for unit_id in self._parts.keys() - shown.keys():
+            self._parts.pop(unit_id).remove()
+            del self._drawn[unit_id]
+        for unit_id, row in shown.items():
+            drawn = (row["range_m"], row["T_world_camera"], row["intrinsics"])
+            if self._drawn.get(unit_id) == drawn:
+                continue
+            self._drawn[unit_id] = drawn
+            pose = np.asarray(row["T_world_camera"])
+            shade = RANGE_SHADE * np.array(STATE_COLOURS[row["state"]]) + (1.0 - RANGE_SHADE) * 255.0
+            # One of the same name takes the place of the one before.
+            self._parts[unit_id] = self._client.scene.add_line_segments(
+                f"/ranges/{unit_id}",
+                view_edges(Intrinsics(**row["intrinsics"]), row["range_m"]),
+                shade.astype(np.uint8),
+                thickness=RANGE_LINE_PX,
+                thickness_units="screen",
                 wxyz=wxyz_of(pose),
                 position=pose[:3, 3],
-            ),
-            self._server.scene.add_label(f"/labels/{unit_id}", text, position=pose[:3, 3] + (0.0, 0.0, 0.15)),
-        )
+            )
+
+    def hide(self) -> None:
+        """Draw it no more."""
+        self.show([])
+
+
+def _has_range(row: dict[str, Any]) -> bool:
+    known = (row["T_world_camera"], row["intrinsics"], row["range_m"])
+    return row["state"] == "live" and all(value is not None for value in known)
 
 
 class UnseenLayer:

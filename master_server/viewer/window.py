@@ -15,8 +15,9 @@ import numpy as np
 import viser
 
 from master_server.viewer.channel import Asker
+from master_server.viewer.look import Wanted
 from master_server.viewer.panel import Panel, Person, lattice_of
-from master_server.viewer.scene import Scene
+from master_server.viewer.scene import Scene, Voxels
 from master_server.viewer.sessions import Viewer
 from shared.cell import Cell
 from shared.clock import NS_PER_S, monotonic_ns, wall_ns
@@ -50,6 +51,7 @@ class Window:
         self._cell: Cell | None = None
         self._cell_sha256 = ""
         self._drawn: tuple[object, ...] = ()
+        self._voxels: Voxels | None = None
         self.server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         # Nobody opens a tunnel to the world from here; the master does not pass such requests on, either.
         self.server.request_share_url = _refuse_to_share  # type: ignore[method-assign]
@@ -110,19 +112,25 @@ class Window:
     def _draw(self, people: list[Person], with_units: bool) -> None:
         for person in people:
             person.go()
-        wants_unseen = with_units and any(person.wants_unseen for person in people)
-        told = self._asker.ask(verb="look", units=with_units, unseen=wants_unseen)
+        wanted = Wanted(
+            units=with_units,
+            unseen=with_units and any(person.wants_unseen for person in people),
+            reports=any(person.wants_by_unit for person in people),
+            since_ns=self._panel.known_ns,
+        )
+        told = self._asker.ask(verb="look", wanted=wanted._asdict())
         if "refused" in told:
             raise Refusal(500, told["refused"])
         if told["cell"] != self._cell_sha256:
             self._load_cell(told["cell"])
         joints = told["joints"]
         self._scene.set_joints(None if joints is None else tuple(joints))
-        drawn = (told["keys"], told["witnesses"], told["lattice"])
+        drawn = (told["keys"], told["witnesses"], told["lattice"], told.get("reports", {}))
         if drawn != self._drawn:
-            self._drawn = drawn
-            keys = np.frombuffer(told["keys"], np.uint32)
-            self._scene.set_voxels(lattice_of(told["lattice"]), keys, np.frombuffer(told["witnesses"], np.uint8))
+            self._drawn, self._voxels = drawn, voxels_of(told)
+        assert self._voxels is not None
+        for person in people:
+            person.draw(self._voxels)
         if with_units:
             self._scene.set_units(told["units"])
             self._panel.show(told, wall_ns() / NS_PER_S)
@@ -147,6 +155,13 @@ class Window:
 
     def _rest(self, seconds: float) -> None:
         threading.Event().wait(max(seconds, 0.0))
+
+
+def voxels_of(told: dict[str, Any]) -> Voxels:
+    """The obstacles of a look."""
+    reports = {unit_id: np.frombuffer(keys, np.uint32) for unit_id, keys in told.get("reports", {}).items()}
+    keys, witnesses = np.frombuffer(told["keys"], np.uint32), np.frombuffer(told["witnesses"], np.uint8)
+    return Voxels.of(lattice_of(told["lattice"]), keys, witnesses, reports)
 
 
 def _named_meshes(document: dict[str, Any]) -> set[str]:

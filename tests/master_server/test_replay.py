@@ -19,15 +19,17 @@ import pytest
 from mcap.writer import Writer
 
 from master_server import recorded as recorded_module
+from master_server import timeline as timeline_module
 from master_server.__main__ import main
 from master_server.access import Access
 from master_server.app import make_app, make_replay_app
 from master_server.master import Master
-from master_server.recorded import Recording, duration_s
+from master_server.recorded import Recording
 from master_server.recording_file import RecordingFile
 from master_server.recording_format import StateRecord, moment_of
 from master_server.replay import Replay, ReplayRequest
 from master_server.routes import map, replay, robot, units
+from master_server.timeline import Timeline, duration_s
 from shared.cell import Cell, PlacedMesh
 from shared.errors import Refusal, SourceError
 from shared.meshes import box_mesh
@@ -150,7 +152,7 @@ def test_every_answer_is_as_it_was(tmp_path: Path, clock: Clock) -> None:
     assert len(reasons) >= 4
     assert len({found["etag"] for found in then.values()}) == 2
 
-    with Recording(tmp_path / "a.mcap") as recording:
+    with Timeline([tmp_path / "a.mcap"]) as recording:
         assert recording.trouble == ""
         played = Replay(recording, clock=clock)
         app = make_replay_app(played, ACCESS)
@@ -170,12 +172,12 @@ def recorded(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def recording(recorded: Path) -> Iterator[Recording]:
-    with Recording(recorded) as recording:
+def recording(recorded: Path) -> Iterator[Timeline]:
+    with Timeline([recorded]) as recording:
         yield recording
 
 
-async def test_it_tells_what_it_is_and_changes_nothing(recording: Recording, clock: Clock) -> None:
+async def test_it_tells_what_it_is_and_changes_nothing(recording: Timeline, clock: Clock) -> None:
     app = make_replay_app(Replay(recording, clock=clock), ACCESS)
     health = await ask(app, "GET", "/healthz", None)
     assert health.json() == {"status": "ok", "replay": True}
@@ -203,7 +205,7 @@ async def test_it_tells_what_it_is_and_changes_nothing(recording: Recording, clo
 
 
 def test_it_plays_pauses_and_moves(recorded: Path, clock: Clock) -> None:
-    with Recording(recorded) as recording:
+    with Timeline([recorded]) as recording:
         assert duration_s(recording) == pytest.approx((STEPS - 1) * 0.1)
         played = Replay(recording, speed=2.0, start_s=0.5, clock=clock)
         heard: list[int] = []
@@ -260,8 +262,8 @@ def test_a_killed_writer_leaves_all_but_its_last_chunk(tmp_path: Path, clock: Cl
     killed = tmp_path / "killed.mcap"
     process = subprocess.run([sys.executable, "-c", WRITER, str(killed)], check=False)
     assert process.returncode == -signal.SIGKILL
-    with Recording(killed) as recording:
-        assert recording.trouble == "its writer was stopped before it could finish it"
+    with Timeline([killed]) as recording:
+        assert recording.trouble == "killed.mcap: its writer was stopped before it could finish it"
         # Chunks of 1 s: of 3.6 s, three are there, of eleven moments each.
         assert duration_s(recording) == pytest.approx(3.2)
         for number in range(33):
@@ -369,3 +371,70 @@ def test_a_moved_object_costs_a_transform_and_no_mesh(recorded: Path) -> None:
             "[1.0, 0.0, 0.0, 0.0]",
             "[1.0, 0.0, 0.0, 0.3]",
         ]
+
+
+def record_in_files(folder: Path, steps: tuple[int, ...], missing_s: float = 0.0) -> list[Path]:
+    """The same script, with a new file after each of these numbers of steps; between two, time is missing."""
+    script = Script()
+    paths, begun = [], 0
+    for number, ended in enumerate((*steps, STEPS)):
+        paths.append(folder / f"{9 - number}.mcap")
+        file = RecordingFile(paths[-1], WALL_LESS_MONOTONIC_NS + round(number * missing_s * S))
+        for step in range(begun, ended):
+            file.add(moment_of(script.master, script.step(step)))
+        file.close()
+        begun = ended
+    return paths
+
+
+def test_files_of_one_recording_are_one_timeline(tmp_path: Path, recorded: Path, clock: Clock) -> None:
+    paths = record_in_files(tmp_path, (13, 26))
+    told: list[tuple[int, int]] = []
+    with Recording(recorded) as whole, Timeline(sorted(paths), lambda *read: told.append(read)) as recording:
+        assert [file.path for file in recording.files] == paths
+        assert (recording.begin_ns, recording.end_ns) == (whole.begin_ns, whole.end_ns)
+        assert recording.trouble == ""
+        assert recording.counts["/cellwatch/state"] == STEPS
+        for number in (*range(STEPS), 3, 38, 14):
+            log_ns = whole.begin_ns + number * STEP_NS
+            assert recording.after(log_ns) == whole.after(log_ns)
+            for found, expected in zip(recording.at(log_ns)[:3], whole.at(log_ns)[:3], strict=True):
+                assert repr(found) == repr(expected)
+        assert [one["objects"] for one in recording.cells] == [one["objects"] for one in whole.cells]
+        assert sorted(recording.meshes) == sorted(whole.meshes)
+        assert recording.mesh(whole.meshes[0]) == whole.mesh(whole.meshes[0])
+        assert recording.mesh("0" * 64) is None
+        with pytest.raises(SourceError, match="is missing"):
+            recording.cell("0" * 64)
+        sizes = sum(path.stat().st_size for path in paths)
+        assert recording.size_bytes == sizes
+        assert told[-1] == (sizes, sizes)
+        assert [read for read, _ in told] == sorted(read for read, _ in told)
+        played = Replay(recording, clock=clock)
+        answer = played.change(ReplayRequest(position_s=2.0, playing=False), clock.now_ns)
+        assert (answer.file, answer.files) == ("8.mcap", 3)
+        assert answer.duration_s == pytest.approx((STEPS - 1) * 0.1)
+
+
+@pytest.mark.parametrize(
+    ("missing_s", "words"), [(1.0, "1 s are missing after 9.mcap"), (-1.0, "it overlaps 9.mcap by 1 s")]
+)
+def test_files_of_several_recordings_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing_s: float, words: str
+) -> None:
+    monkeypatch.setattr(timeline_module, "GAP_MAX_S", 0.5)
+    with pytest.raises(SourceError, match=words):
+        Timeline(record_in_files(tmp_path, (20,), missing_s))
+
+
+def test_each_file_counts_once(recorded: Path) -> None:
+    with pytest.raises(SourceError, match="expected each file once"):
+        Timeline([recorded, recorded])
+
+
+def test_info_tells_of_all_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = record_in_files(tmp_path, (13,))
+    assert main(["recording-info", *(str(path) for path in paths)]) == 0
+    out = capsys.readouterr().out
+    assert all(str(path) in out for path in paths)
+    assert "(3.9 s)" in out

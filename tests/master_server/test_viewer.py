@@ -17,15 +17,28 @@ import pytest
 
 from master_server.access import Access
 from master_server.app import add_viewer, make_app
+from master_server.history import SAMPLES_MAX, History, Sample
+from master_server.master import Master
 from master_server.tokens import Role
-from master_server.viewer.look import look
-from master_server.viewer.panel import contact_sheet, lattice_of, status_html, table_html
+from master_server.viewer.look import Wanted, look
+from master_server.viewer.panel import contact_sheet, lattice_of, legend_html, status_html, table_html
 from master_server.viewer.proxy import LOGIN_PAGE, Gate, is_passed, link_path
-from master_server.viewer.scene import cube, surface
+from master_server.viewer.scene import (
+    SHARED_COLOUR,
+    UNIT_COLOURS,
+    WITNESS_COLOURS,
+    cube,
+    linear,
+    surface,
+    unit_colour,
+    view_edges,
+)
 from master_server.viewer.sessions import LINK_S, LINKS_MAX, SESSION_S, Sessions, Viewer
+from master_server.viewer.window import voxels_of
+from shared.camera import Intrinsics
 from shared.errors import Refusal
 from shared.lattice import Lattice
-from tests.master_server.fakes import START_NS, S, master
+from tests.master_server.fakes import START_NS, S, joined, master, sees_all
 
 UNIT, OPERATOR = b"u" * 32, b"o" * 32
 WALL_NS = 1_800_000_000 * S
@@ -170,7 +183,11 @@ def test_noise_is_not_passed_on(data: bytes) -> None:
 
 def test_a_look_tells_what_is_drawn() -> None:
     watched = master()
-    told = msgpack.unpackb(msgpack.packb(look(watched, True, True, START_NS)))
+    history = History(watched)
+    history.take(START_NS - S)
+    history.take(START_NS)
+    told = told_of(watched, history, Wanted(units=True, unseen=True, since_ns=START_NS - S))
+    assert [Sample(*values) for values in told["history"]] == [Sample(START_NS, None, 0, 0, False)]
     assert lattice_of(told["lattice"]) == watched.lattice
     blocks = lattice_of(told["blocks"])
     assert len(told["seen"]) == -(-blocks.cell_count // 8)
@@ -178,7 +195,87 @@ def test_a_look_tells_what_is_drawn() -> None:
     assert told["robot"]["state"] == "none"
     assert "The map is not complete" in status_html(told)
     assert "No unit has registered yet" in table_html(told["units"])
-    assert "units" not in look(watched, False, False, START_NS)
+    assert not {"units", "history", "reports", "seen"} & told_of(watched, history, Wanted()).keys()
+
+
+def told_of(watched: Master, history: History, wanted: Wanted, now_ns: int = START_NS) -> dict[str, Any]:
+    """A look as it comes out of the channel."""
+    told: dict[str, Any] = msgpack.unpackb(msgpack.packb(look(watched, history, wanted, now_ns)), strict_map_key=False)
+    return told
+
+
+def test_colours_tell_how_many_or_who() -> None:
+    watched = master()
+    for number, keys in ((1, [3, 4]), (2, [4, 5])):
+        joined(watched, number).update(START_NS, keys, seen=sees_all(watched))
+    history = History(watched)
+    voxels = voxels_of(told_of(watched, history, Wanted(reports=True)))
+    assert voxels.owners.tolist() == [1, 0, 2]
+    assert voxels.colours(by_unit=False).tolist() == linear([WITNESS_COLOURS[i] for i in (0, 1, 0)]).tolist()
+    expected = linear([unit_colour(1), SHARED_COLOUR, unit_colour(2)])
+    assert voxels.colours(by_unit=True).tolist() == expected.tolist()
+    # Nobody asked who reports them.
+    assert voxels_of(told_of(watched, history, Wanted())).owners.tolist() == [0, 0, 0]
+
+
+def test_what_is_linear_is_shown_as_meant() -> None:
+    assert linear([(0, 0, 0), (255, 128, 10)]).tolist() == [[0, 0, 0], [255, 55, 1]]
+
+
+def test_every_colour_of_a_unit_is_another() -> None:
+    colours = np.array([*UNIT_COLOURS, SHARED_COLOUR], int)
+    apart = np.abs(colours[:, None] - colours[None]).sum(axis=2) + 999 * np.eye(len(colours), dtype=int)
+    assert apart.min() > 100
+    assert unit_colour(len(UNIT_COLOURS) + 1) == unit_colour(1)
+
+
+def test_a_legend_names_what_is_drawn() -> None:
+    rows = [{"id": 1}, {"id": 4}]
+    assert [text in legend_html(False, rows, True) for text in ("1 unit<", "2 units<", "3 or more<", "unit 4")] == [
+        True, True, True, False,
+    ]  # fmt: skip
+    by_unit = legend_html(True, rows, True)
+    assert all(f"rgb{unit_colour(row['id'])}" in by_unit and f"unit {row['id']}<" in by_unit for row in rows)
+    assert "several units" in by_unit
+    assert "not recorded" in legend_html(True, rows, False)
+
+
+def test_a_view_is_that_of_its_own_camera() -> None:
+    wide, narrow = Intrinsics(640, 480, 320.0, 320.0, 319.5, 239.5), Intrinsics(848, 480, 848.0, 848.0, 400.0, 239.5)
+    for camera in (wide, narrow):
+        edges = view_edges(camera, 2.0)
+        assert edges.shape == (8, 2, 3)
+        np.testing.assert_array_equal(edges[:4, 0], 0.0)
+        pixels = camera.project(edges[:4, 1].astype(np.float64))
+        right, bottom = camera.width - 0.5, camera.height - 0.5
+        np.testing.assert_allclose(pixels, [(-0.5, -0.5), (right, -0.5), (right, bottom), (-0.5, bottom)], atol=1e-3)
+        assert (edges[:4, 1, 2] == 2.0).all()
+
+
+def test_who_learns_shows_how_far_it_is() -> None:
+    row = {
+        "id": 1, "ip": "10.0.0.1", "state": "blind", "reason": "learning the background: frame 12 of 60", "age_s": 0.1,
+        "fps": 15.0, "process_ms": 5.0, "voxels": 0, "last_command": None,
+        "health": {"valid_share": 0.9, "agreeing_share": 0.0, "static_share": 0.0},
+    }  # fmt: skip
+    assert '<progress value="12" max="60"></progress>' in table_html([row])
+    assert "<progress" not in table_html([row | {"reason": "frame 12 of 60"}])
+
+
+async def test_the_last_minutes_are_there_for_who_asks() -> None:
+    watched = master()
+    app = make_app(watched, Access(UNIT, OPERATOR))
+    joined(watched, 1).update(START_NS, [3], seen=sees_all(watched))
+    for number in range(SAMPLES_MAX + 5):
+        app.state.history.take(START_NS + number * S // 1000)
+    async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://master:8420") as client:
+        assert (await client.get("/history")).status_code == 401
+        answer = await client.get("/history", headers={"Authorization": f"Bearer {UNIT.decode()}"})
+    told = answer.json()
+    assert len(told["at_ns"]) == len(told["voxels"]) == SAMPLES_MAX
+    assert told["at_ns"][0] == START_NS + 5 * S // 1000
+    assert (told["voxels"][0], told["units_live"][0], told["complete"][0]) == (1, 1, True)
+    assert told["oldest_view_age_s"][0] == pytest.approx(0.035, abs=2e-3)
 
 
 def test_what_a_unit_says_of_itself_is_no_markup() -> None:

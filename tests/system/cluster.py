@@ -40,13 +40,14 @@ def write_cell(folder: Path) -> Path:
     return path
 
 
-def write_recording(folder: Path) -> Path:
+def write_recording(folder: Path, focal_px: float = FOCAL_PX) -> Path:
     """A patch of half a metre, 1.5 m before the camera; all else is far outside the cell."""
     folder.mkdir()
     depth = np.full((HEIGHT, WIDTH), WALL_MM, np.uint16)
-    depth[40:80, 60:100] = PATCH_MM
+    half = round(20 * focal_px / FOCAL_PX)
+    depth[HEIGHT // 2 - half : HEIGHT // 2 + half, WIDTH // 2 - half : WIDTH // 2 + half] = PATCH_MM
     np.savez(folder / "00.npz", depth=depth)
-    k = [FOCAL_PX, 0.0, (WIDTH - 1) / 2, 0.0, FOCAL_PX, (HEIGHT - 1) / 2, 0.0, 0.0, 1.0]
+    k = [focal_px, 0.0, (WIDTH - 1) / 2, 0.0, focal_px, (HEIGHT - 1) / 2, 0.0, 0.0, 1.0]
     (folder / "camera_info.yaml").write_text(yaml.safe_dump({"width": WIDTH, "height": HEIGHT, "k": k}))
     return folder
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import pty
@@ -20,11 +21,13 @@ import numpy as np
 import psutil
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from master_server.viewer.scene import STATE_COLOURS, VIEW_FOV_RAD, view_of
+from master_server.viewer.scene import STATE_COLOURS, VIEW_FOV_RAD, view_edges, view_of
+from shared.camera import Intrinsics
 from shared.transforms import apply, inverse, look_at
 from tests.system.browser import OUT, Witness, a_browser, opened, shot
 from tests.system.cluster import CELL, START_S, Cluster, stop, until, write_cell, write_recording
@@ -35,6 +38,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 LOOKING_ALONG_Y = {"xyz": [1.0, -1.0, 1.0], "rpy_deg": [-90.0, 0.0, 0.0]}
 LOOKING_ALONG_X = {"xyz": [-1.0, 1.0, 1.0], "rpy_deg": [-90.0, 0.0, -90.0]}
+FOCALS_PX = {1: 120.0, 2: 200.0}
+"""Of a wide camera and a narrow one."""
+
 SEEN_S = 40.0
 """Until a change is on a screen that is painted without a graphics card on a busy machine."""
 
@@ -82,7 +88,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TerminalCluste
     with TerminalCluster(folder, write_cell(folder)) as cluster:
         cluster.start_master("--set", "unit_actions.Ring the bell=http://127.0.0.1:9/{ip}")
         for number, pose in enumerate((LOOKING_ALONG_Y, LOOKING_ALONG_X), 1):
-            frames = str(write_recording(folder / f"frames{number}"))
+            frames = str(write_recording(folder / f"frames{number}", FOCALS_PX[number]))
             source = {"kind": "recorded", "folder": frames, "fps": 10.0, "loop": True}
             cluster.start_unit(number, source, T_world_camera=pose)
         cluster.until_live(2, 3 * START_S)
@@ -178,6 +184,82 @@ def test_obstacles_are_drawn_where_they_are(cluster: TerminalCluster, page: Page
     assert marked[:, :800].sum() - inside < 0.1 * inside
 
 
+def is_unit_2(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Pixels in the hue of what unit 2 alone reports, which no other thing has."""
+    red, green, blue = (picture[..., i].astype(int) for i in range(3))
+    return (green - red > 50) & (blue - red > 45)
+
+
+def choose(page: Page, label: str, option: str) -> None:
+    page.get_by_label(label, exact=True).click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def test_colours_tell_the_unit_for_who_wants_it(cluster: TerminalCluster, page: Page) -> None:
+    legend = page.locator('[data-cellwatch="legend"]')
+    expect(legend).to_contain_text("2 units")
+    places = on_screen(page, np.array(cluster.get("/voxels?form=centres")["voxels"]))
+
+    def share(picture: NDArray[np.uint8]) -> float:
+        return float(is_unit_2(picture)[places[:, 1], places[:, 0]].mean())
+
+    assert share(shot(page, "by-number")) == 0.0
+    choose(page, "voxels by", "unit")
+    expect(legend).to_contain_text("several units", timeout=SEEN_S * 1000)
+    picture = until_shown(page, lambda picture: share(picture) > 0.2, "by-unit")
+    assert is_obstacle(picture)[places[:, 1], places[:, 0]].mean() > 0.2
+    choose(page, "voxels by", "number of units")
+    until_shown(page, lambda picture: share(picture) == 0.0, "by-number-again")
+
+
+def range_lines(page: Page, row: dict[str, Any], intrinsics: dict[str, Any]) -> NDArray[np.int64]:
+    """Pixels (N, 2) along the edges of what a unit's camera would look through with these intrinsics."""
+    edges = view_edges(Intrinsics(**intrinsics), row["range_m"]).astype(np.float64)
+    steps = np.linspace(0.5, 1.0, 60)[:, None, None]
+    points = (edges[:4, 0] * (1.0 - steps) + edges[:4, 1] * steps).reshape(-1, 3)
+    places = on_screen(page, apply(np.array(row["T_world_camera"]), points))
+    return places[(places[:, 0] > 5) & (places[:, 0] < 800) & (places[:, 1] > 5) & (places[:, 1] < 795)]
+
+
+def share_lined(picture: NDArray[np.uint8], places: NDArray[np.int64]) -> float:
+    """Share of the places at which, or beside which, there is the light green of a live camera's range."""
+    red, green, blue = (picture[..., i].astype(int) for i in range(3))
+    is_green = (green - red > 18) & (green - blue > 12)
+    near = [is_green[places[:, 1] + y, places[:, 0] + x] for x in (-2, -1, 0, 1, 2) for y in (-2, -1, 0, 1, 2)]
+    return float(np.any(near, axis=0).mean())
+
+
+def test_each_camera_shows_its_own_view(cluster: TerminalCluster, page: Page) -> None:
+    wide, narrow = sorted(cluster.get("/units"), key=lambda unit: str(unit["ip"]))
+    assert (wide["intrinsics"]["fx"], narrow["intrinsics"]["fx"]) == (FOCALS_PX[1], FOCALS_PX[2])
+    for unit, other in ((wide, narrow), (narrow, wide)):
+        # From a metre before the box to its far side, less half a block.
+        assert unit["range_m"] == 2.95
+        own, others = (range_lines(page, unit, one["intrinsics"]) for one in (unit, other))
+        assert len(own) > 60
+        picture = until_shown(page, lambda picture, own=own: share_lined(picture, own) > 0.8, "ranges")  # type: ignore[misc]
+        assert share_lined(picture, others) < 0.4
+    page.get_by_role("checkbox", name="how far cameras see").uncheck(force=True)
+    places = range_lines(page, wide, wide["intrinsics"])
+    until_shown(page, lambda picture: share_lined(picture, places) < 0.1, "ranges-off")
+    page.get_by_role("checkbox", name="how far cameras see").check(force=True)
+
+
+def test_the_last_minutes_are_there_at_once(cluster: TerminalCluster, page: Page) -> None:
+    history = cluster.get("/history")
+    assert len(history["at_ns"]) > 5
+    plot = page.locator(".uplot").first
+    plot.scroll_into_view_if_needed()
+
+    def is_drawn() -> bool:
+        page.wait_for_timeout(300)
+        picture = np.asarray(Image.open(io.BytesIO(plot.screenshot())).convert("RGB")).astype(int)
+        return int(((picture[..., 2] - picture[..., 0]) > 60).sum()) > 100
+
+    until(is_drawn, "the plot", SEEN_S)
+    shot(page, "plots")
+
+
 def test_a_setting_reaches_the_units(cluster: TerminalCluster, page: Page) -> None:
     versions = [unit["versions"]["lattice"] for unit in cluster.get("/units")]
     page.get_by_label("voxel size [m]").fill("0.08")
@@ -233,6 +315,23 @@ def test_a_unit_that_dies_turns_its_frustum_and_its_row(cluster: TerminalCluster
     expect(page.locator('[data-cellwatch="status"]')).to_contain_text(f"unit {victim['id']} (127.0.0.3) is stale")
     killed = until_shown(page, lambda picture: count_of(picture, "stale", place) > 60, "unit-killed")
     assert count_of(killed, "live", others) > 60
+
+
+def test_a_unit_is_forgotten_only_once_it_is_confirmed(cluster: TerminalCluster, page: Page) -> None:
+    (victim,) = [unit for unit in cluster.get("/units") if unit["state"] == "stale"]
+    choose(page, "unit", f"{victim['id']} · {victim['ip']}")
+    page.get_by_role("button", name="Forget this unit").click()
+    asked = page.locator('[data-cellwatch="confirm"]')
+    expect(asked).to_contain_text(f"unit {victim['id']} · {victim['ip']}", timeout=SEEN_S * 1000)
+    shot(page, "confirm")
+    page.get_by_role("button", name="Keep it").click()
+    expect(asked).to_have_count(0, timeout=SEEN_S * 1000)
+    assert victim["id"] in [unit["id"] for unit in cluster.get("/units")]
+    page.get_by_role("button", name="Forget this unit").click()
+    page.get_by_role("button", name="Forget it").click()
+    expect(row(page, victim["id"])).to_have_count(0, timeout=SEEN_S * 1000)
+    assert victim["id"] not in [unit["id"] for unit in cluster.get("/units")]
+    expect(asked).to_have_count(0, timeout=SEEN_S * 1000)
 
 
 def test_without_the_right_token_there_is_nothing_to_see(

@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench-pipeline bench-board bench-master bench-scale bench-stance bench-paper viewer-test rehearsal pictures test lint clean libusb
+.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-pipeline bench-board bench-master bench-scale bench-stance bench-paper viewer-test rehearsal pictures test lint clean libusb
 
 ARGS ?=
 EXTRAS := edge,master,realsense,sim,dev
@@ -43,6 +43,9 @@ faults: $(READY) ## units, master, networks, clocks and disks that fail: what th
 
 plug-and-play: $(READY) ## four units that know nothing but a token, and what people do to them later
 	@$(BIN)/python -m benchmarks.plug_and_play $(ARGS)
+
+bench: $(BENCH_READY) libusb ## what Cellwatch claims, measured anew in some 20 minutes: benchmarks/REPORT.md
+	@$(BIN)/python -m benchmarks.bench $(ARGS)
 
 bench-pipeline: $(BENCH_READY) libusb ## what a frame costs, beside Open3D, OctoMap and Embree on the same frames
 	@$(BIN)/python -m benchmarks.pipeline $(ARGS)

@@ -54,4 +54,8 @@ In the order of the flow:
     paper_running a refresh by such processes on this machine
     paper_tables the paper's tables anew, and beside them what it states
     paper        the paper's experiment, in one command
+    parts        each part of the report: its command, the question that it answers, how long it may take
+    plots        curves as pictures
+    report_page  all results as one page
+    bench        those that fit into twenty minutes, and the page
 """

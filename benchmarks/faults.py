@@ -36,7 +36,7 @@ from benchmarks.fault_watch import (
     in_force,
     judge,
 )
-from benchmarks.report import line, table, write
+from benchmarks.report import Mark, Result, line, write
 from edge_unit.config import ENVIRONMENT_PREFIX as UNIT_PREFIX
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError
@@ -548,22 +548,22 @@ async def strike_all(faults: Sequence[Fault]) -> list[dict[str, Any]]:
     return rows
 
 
-def text(rows: Sequence[dict[str, Any]]) -> str:
-    """The table for people."""
+def result_of(rows: Sequence[dict[str, Any]]) -> Result:
+    """The table, and what is asked of all faults together."""
     what = {fault.name: fault.what for fault in FAULTS}
     columns = (
         "fault",
         "what happens",
         "noticed_s",
         "recovered_s",
-        "stream:",
-        "",
+        "stream: noticed_s",
+        "stream: recovered_s",
         "false_free",
         "lost",
-        "",
+        "mark",
         "what the map told",
     )
-    cells = [
+    cells = tuple(
         (
             each["name"],
             what[each["name"]],
@@ -577,10 +577,24 @@ def text(rows: Sequence[dict[str, Any]]) -> str:
             str(each.get("first_false") or each.get("trouble") or each["told"]).split(";")[0],
         )
         for each in rows
-    ]
+    )
     started = ", ".join(f"{each['name']} {each['process_start_s']:.3f}" for each in rows if "process_start_s" in each)
     starts = (f"From the start of a unit's process until it registered, s: {started}.",) if started else ()
-    return "\n".join(("Faults, with real processes", *table(columns, cells), *REMARKS, *starts))
+    marks = (
+        Mark("faults after which a mark was missed", float(sum(not each["met"] for each in rows)), at_most=0.0),
+        Mark("longest until it was noticed, s", _longest(rows, "noticed_s"), at_most=NOTICED_S_MAX),
+        Mark("longest until the map was right again, s", _longest(rows, "recovered_s"), at_most=RECOVERED_S_MAX),
+        Mark(
+            "faults that made a map say free of what nobody sees", float(sum(each["false_free"] for each in rows)), 0.0
+        ),
+        Mark("acknowledged things lost", float(sum(each["lost"] for each in rows)), at_most=0.0),
+    )
+    return Result("Faults, with real processes", columns, cells, marks, (*REMARKS, *starts))
+
+
+def _longest(rows: Sequence[dict[str, Any]], name: str) -> float:
+    """Of those in which there was something to notice or to recover from."""
+    return max((each[name] for each in rows if each[name] is not None), default=0.0)
 
 
 REMARKS = (
@@ -614,12 +628,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         return 130
+    result = result_of(rows)
     document = {"faults": rows}
     if not options.names:
-        write("faults", document)
-    print(text(rows))
+        write("faults", result.document() | document)
+    print(result)
     print(line(document))
-    return 0 if all(each["met"] for each in rows) else 1
+    return 0 if all(mark.met for mark in result.marks) else 1
 
 
 def _parser() -> argparse.ArgumentParser:

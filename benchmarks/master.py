@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.load import FRAME_RATE_HZ, Plan
-from benchmarks.report import RESULTS, Mark, line, table, write
+from benchmarks.report import RESULTS, Mark, Result, line, write
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, UplinkError
 from simulation.fleet import MASTER_PREFIX
@@ -166,19 +166,25 @@ async def measure(units: Sequence[int], voxels: Sequence[int], seconds: float, t
         folder = Path(scratch)
         async with Processes(folder / "logs", without=(MASTER_PREFIX,)) as processes:
             bench = Bench(processes, folder, seconds)
-            print(f"A master and its units at {FRAME_RATE_HZ:g} updates/s each, {seconds:g} s, joints at 125 Hz")
             loads = [await bench.at_rate(n, size) for n in units for size in voxels]
-            print("\n".join(table(*_load_table(loads))), flush=True)
+            rates = Result(
+                f"A master and its units at {FRAME_RATE_HZ:g} updates/s each, {seconds:g} s, joints at 125 Hz",
+                *_load_table(loads),
+            )
+            print(rates, flush=True)
             ours, bare = [], []
             for _ in range(turns):
                 ours.append(await bench.at_most(bare=False))
                 bare.append(await bench.at_most(bare=True))
-    print(f"Updates/s of {MOST_VOXELS} voxels at most, {MOST_UNITS} connections, turns of {min(seconds, TURN_S):g} s")
     rows: list[tuple[str | float, ...]] = []
     for name, turn in (("the master, everything on", ours), ("bare FastAPI, msgpack to numpy", bare)):
         rows.append((name, *(per_s for per_s, _ in turn), *_best(turn)))
-    columns = ("", *(f"turn {n + 1}" for n in range(turns)), "best", "CPU us an update")
-    print("\n".join(table(columns, rows)), flush=True)
+    most = Result(
+        f"Updates/s of {MOST_VOXELS} voxels at most, {MOST_UNITS} connections, turns of {min(seconds, TURN_S):g} s",
+        ("server", *(f"turn {n + 1}" for n in range(turns)), "best", "CPU us an update"),
+        tuple(rows),
+    )
+    print(most, flush=True)
     (our_rate, our_cpu_us), (bare_rate, bare_cpu_us) = _best(ours), _best(bare)
     return {
         "loads": loads,
@@ -192,6 +198,7 @@ async def measure(units: Sequence[int], voxels: Sequence[int], seconds: float, t
             "bare_fastapi_updates_per_s": [per_s for per_s, _ in bare],
         },
         "own_core": bench.apart,
+        "tables": [rates.document(), most.document()],
         "load_average_before": os.getloadavg()[0],
     }
 
@@ -239,7 +246,7 @@ def _best(turns: list[tuple[float, float]]) -> tuple[float, float]:
     return max(per_s for per_s, _ in turns), min(cpu_us for _, cpu_us in turns)
 
 
-def _load_table(loads: list[dict[str, Any]]) -> tuple[tuple[str, ...], list[tuple[str | float, ...]]]:
+def _load_table(loads: list[dict[str, Any]]) -> tuple[tuple[str, ...], tuple[tuple[str | float, ...], ...]]:
     names = {
         "units": "units",
         "voxels": "voxels",
@@ -252,7 +259,7 @@ def _load_table(loads: list[dict[str, Any]]) -> tuple[tuple[str, ...], list[tupl
         "bytes_per_update": "bytes",
         "bytes_per_seen_report": "seen report",
     }
-    rows = [(*(load[name] for name in names), load["map_wrong"] or "right") for load in loads]
+    rows = tuple((*(load[name] for name in names), load["map_wrong"] or "right") for load in loads)
     return (*names.values(), "map"), rows
 
 

@@ -12,13 +12,12 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.report import RESULTS, Mark, line, table, write
+from benchmarks.report import RESULTS, Mark, Result, line, write
 from benchmarks.ur3_scene import Recording, record
 from edge_unit.pipeline import DepthPipeline
 from shared.clock import NS_PER_MS, stage_ns
@@ -35,8 +34,6 @@ TABLE_TURNS = 8
 
 ARBITRARY_RAW = (300, 2500)
 """Each pixel of the worst frame has a depth of its own from this range: no frame touches more voxels."""
-
-PACKAGES = ("numpy", "numba", "open3d", "octomap-python", "embreex")
 
 Work = Callable[[int], object]
 
@@ -119,9 +116,12 @@ def contenders_of(frames: Recording) -> dict[str, Work]:
 def compare(frames: Recording, turns: int) -> tuple[dict[str, Any], list[Mark]]:
     """What a frame costs beside its peers: figures by name, and the marks that they are held against."""
     spent = in_turns(contenders_of(frames), turns, len(frames.depth))
-    rows = [(name, each.median, each.p99, each.first) for name, each in spent.items()]
-    print(f"{SIZE[0]}x{SIZE[1]}, UR3, {VOXEL_M * 1e3:g} mm voxels, one thread, {turns} turns of {FRAMES_A_TURN} frames")
-    print("\n".join(table(("what", "median ms", "p99 ms", "first of a turn"), rows)), flush=True)
+    result = Result(
+        f"{SIZE[0]}x{SIZE[1]}, UR3, {VOXEL_M * 1e3:g} mm voxels, one thread, {turns} turns of {FRAMES_A_TURN} frames",
+        ("what", "median ms", "p99 ms", "first of a turn, ms"),
+        tuple((name, each.median, each.p99, each.first) for name, each in spent.items()),
+    )
+    print(result, flush=True)
 
     def times(theirs: str, ours: str) -> float:
         return spent[theirs].median / spent[ours].median
@@ -155,6 +155,7 @@ def compare(frames: Recording, turns: int) -> tuple[dict[str, Any], list[Mark]]:
         "surfaces_vs_open3d": times("Open3D, the room's surfaces at 20 mm", surface),
         "seen_and_health_ms": spent["seen() and health()"].median,
         "spent_ms": {n: {"median": s.median, "p99": s.p99, "first": s.first} for n, s in spent.items()},
+        "contenders": result.document(),
     }
     marks = [
         Mark("process(), times faster than Open3D", figures["vs_open3d"], at_least=30.0),
@@ -174,11 +175,16 @@ def costs_by_size(recordings: Sequence[Recording], turns: int) -> tuple[dict[str
         spent = in_turns({name: _work(each, frames) for name, each in pipelines.items()}, turns, len(frames.depth))
         size = f"{frames.intrinsics.width}x{frames.intrinsics.height}"
         costs[size] = {name: each.median for name, each in spent.items()}
-    print("process(), median ms by resolution and voxel size, 10 % of the pixels foreground")
-    rows: list[tuple[str | float, ...]] = [(name, *each.values()) for name, each in costs.items()]
-    print("\n".join(table(("", *next(iter(costs.values()))), rows)), flush=True)
+    result = Result(
+        "process(), median ms by resolution and voxel size, 10 % of the pixels foreground",
+        ("resolution", *next(iter(costs.values()))),
+        tuple((name, *each.values()) for name, each in costs.items()),
+    )
+    print(result, flush=True)
     ratio = max(each["10 mm"] / each["50 mm"] for each in costs.values())
-    return {"process_ms_by_size": costs}, [Mark("10 mm voxels, in costs of 50 mm", ratio, at_most=2.0)]
+    return {"process_ms_by_size": costs, "sizes": result.document()}, [
+        Mark("10 mm voxels, in costs of 50 mm", ratio, at_most=2.0)
+    ]
 
 
 def _work(pipeline: DepthPipeline, frames: Recording) -> Work:
@@ -189,12 +195,6 @@ def single_thread() -> None:
     """Ours has one thread; before they are imported, have the peers on one, too."""
     os.environ.update(OMP_NUM_THREADS="1", TBB_NUM_THREADS="1")
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-
-
-def machine() -> dict[str, str]:
-    """On what it was measured."""
-    models = [row.partition(":")[2].strip() for row in Path("/proc/cpuinfo").read_text().splitlines() if "model" in row]
-    return {"cpu": models[-1] if models else "unknown"} | {name: metadata.version(name) for name in PACKAGES}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -211,7 +211,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     marks += more
     print("\n".join(map(str, marks)))
-    document = figures | sizes | {"machine": machine(), "marks": [mark.document() for mark in marks]}
+    document = figures | sizes | {"marks": [mark.document() for mark in marks]}
     document["passed"] = all(mark.met for mark in marks)
     write("pipeline", document, options.results)
     print(line(document))

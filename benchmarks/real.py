@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from benchmarks import real_frames
 from benchmarks.real_frames import EMPTY_FRAMES, WATCHED_FRAMES, FrameMarks, RealFrames
+from benchmarks.report import RESULTS, Mark, Result, line, write
 from edge_unit.config import ENVIRONMENT_PREFIX as UNIT_PREFIX
 from edge_unit.config import SourceConfig
 from edge_unit.pipeline import DepthPipeline
@@ -45,6 +46,10 @@ FRAME_S = 1.0
 """How long each frame is shown: long enough to ask for the map that it made."""
 
 POLL_S = 0.05
+
+LEAK_PERCENT_MAX = 0.3
+MISS_PERCENT_MAX = 2.5
+SECOND_ROBOT_VOXELS_MIN = 90.0
 
 PICTURE_DEPTH_M = 4.0
 """Depth that is drawn in the last colour."""
@@ -80,7 +85,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"make real: {error}", file=sys.stderr)
         return 1
     result = judge(frames, maps, recorded, options.out)
-    print(json.dumps(result))
+    write("real", result, options.results)
+    print(line(result))
     return 0 if result["passed"] else 1
 
 
@@ -130,41 +136,54 @@ async def play(folder: Path, source: SourceConfig) -> dict[int, SeenMap]:
 
 
 def judge(frames: RealFrames, maps: dict[int, SeenMap], recorded: dict[int, SeenMap], out: Path) -> dict[str, Any]:
-    """Print the marks of each frame, draw its picture, and sum up."""
+    """Print the figures of each frame, draw its picture, and sum up."""
     out.mkdir(parents=True, exist_ok=True)
-    marks: list[FrameMarks] = []
+    judged: list[FrameMarks] = []
+    rows: list[tuple[str | float, ...]] = []
     same = True
     for frame in WATCHED_FRAMES:
         seen = maps[frame]
         found = frames.pipeline.process(frames.depth[frame], frames.joints[frame])
         same &= np.array_equal(found.keys, seen.keys)
-        marks.append(frames.marks(frame, seen.keys))
+        judged.append(frames.marks(frame, seen.keys))
         picture = out / f"frame{frame}.png"
         cv2.imwrite(str(picture), draw(frames, frame, seen.keys))
-        print(
-            f"frame {frame}: leak {marks[-1].robot_leak_percent:.3f} %, "
-            f"missed {marks[-1].second_robot_miss_percent:.2f} %, "
-            f"second robot {marks[-1].second_robot_voxels} voxels, false {marks[-1].false_voxels}, "
-            f"{seen.process_ms:.1f} ms from images, {recorded[frame].process_ms:.1f} ms from the recording, "
-            f"picture {picture}"
-        )
+        each = judged[-1]
+        shares = (each.robot_leak_percent, each.second_robot_miss_percent)
+        counts = (each.second_robot_voxels, each.false_voxels)
+        rows.append((f"frame {frame}", *shares, *counts, seen.process_ms, recorded[frame].process_ms))
     equal = all(np.array_equal(maps[frame].keys, recorded[frame].keys) for frame in WATCHED_FRAMES)
-    leak = max(mark.robot_leak_percent for mark in marks)
-    miss = max(mark.second_robot_miss_percent for mark in marks)
-    voxels = min(mark.second_robot_voxels for mark in marks)
-    false = max(mark.false_voxels for mark in marks)
-    return {
+    leak = max(each.robot_leak_percent for each in judged)
+    miss = max(each.second_robot_miss_percent for each in judged)
+    voxels = min(each.second_robot_voxels for each in judged)
+    false = max(each.false_voxels for each in judged)
+    marks = (
+        Mark("robot pixels reported, % of a frame's, worst frame", leak, at_most=LEAK_PERCENT_MAX),
+        Mark("second robot's pixels not reported, %, worst frame", miss, at_most=MISS_PERCENT_MAX),
+        Mark("voxels of the second robot, fewest", float(voxels), at_least=SECOND_ROBOT_VOXELS_MIN),
+        Mark("false voxels, most", float(false), at_most=0.0),
+        Mark("the merged map is what the pipeline finds", float(same), at_least=1.0),
+        Mark("an SDK recording gives what the images give", float(equal), at_least=1.0),
+    )
+    result = Result(
+        "Recorded frames of a real robot, margins at their defaults",
+        ("frame", "leak %", "missed %", "second robot, voxels", "false", "ms, images", "ms, recording"),
+        tuple(rows),
+        marks,
+    )
+    print(result)
+    return result.document() | {
         "robot_leak_percent_max": round(leak, 3),
         "second_robot_miss_percent_max": round(miss, 2),
         "second_robot_voxels_min": voxels,
         "false_voxels_max": false,
-        "frames": len(marks),
+        "frames": len(judged),
         "map_equals_pipeline": same,
         "recording_equals_images": equal,
         "process_ms_max": round(max(seen.process_ms for seen in maps.values()), 2),
         "recording_process_ms_max": round(max(seen.process_ms for seen in recorded.values()), 2),
         "pictures": str(out),
-        "passed": leak <= 0.3 and miss <= 2.5 and voxels >= 90 and false == 0 and same and equal,
+        "passed": all(mark.met for mark in marks),
     }
 
 
@@ -278,6 +297,7 @@ def _operator(ready: dict[str, Any]) -> dict[str, str]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="make real", description="The filter on real frames, end to end.")
     parser.add_argument("--out", type=Path, default=Path("out/real"), metavar="DIR", help="for the pictures")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for real.json")
     return parser
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import RESULTS, Mark, line, table, write
+from benchmarks.report import RESULTS, Mark, Result, line, write
 from benchmarks.sweeps import runner
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.stance import BASELINE_LOOKS_MAX, PERIOD_S, WINDOW, Stance
@@ -137,17 +137,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     hours = sum(one.quiet_looks for one in found) * PERIOD_S / 3600.0
     alarms = [reason for one in found for reason in one.alarms]
     marks.append(Mark("false alarms, looks", float(len(alarms)), at_most=0.0))
-    columns = ("what", "trials", "told s, median", "worst", "% late", "over s, worst")
-    print("\n".join(table(columns, rows)))
-    print(f"{len(alarms)} of {round(hours * 3600.0 / PERIOD_S)} looks in {hours:.2f} camera hours were false alarms")
-    print("\n".join([*sorted(set(alarms)), *map(str, marks)]))
-    document = {
-        "resolution": "{}x{}".format(*options.resolution),
-        "rows": [dict(zip(columns, row, strict=True)) for row in rows],
+    size = "{}x{}".format(*options.resolution)
+    looks = f"{len(alarms)} of {round(hours * 3600.0 / PERIOD_S)} looks in {hours:.2f} camera hours were false alarms"
+    result = Result(
+        f"Cameras knocked, covered and dazzled while one or two people walk, {size}",
+        ("what", "trials", "told s, median", "worst", "% late", "over s, worst"),
+        tuple(rows),
+        tuple(marks),
+        (looks, *sorted(set(alarms))),
+    )
+    print(result)
+    document = result.document() | {
+        "resolution": size,
         "camera_hours": hours,
         "false_alarm_looks": len(alarms),
         "seconds_to_notice_max": max((row[3] for row in rows), default=float("nan")),
-        "marks": [mark.document() for mark in marks],
         "passed": all(mark.met for mark in marks),
     }
     write("stance", document, options.results)

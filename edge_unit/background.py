@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,15 +14,13 @@ import numpy as np
 from edge_unit.reference import Reference
 from edge_unit.sources.frame import CameraInfo
 from shared.errors import InputError
+from shared.files import StateFile
 from shared.transforms import Transform
 
 logger = logging.getLogger(__name__)
 
 SAME_POSE = 1e-6
 """Poses travel as text and binary; beyond this (m, and parts of a rotation) the camera is elsewhere."""
-
-MAX_LABEL_BYTES = 16_384
-"""Of the label beside the images: a few dozen numbers."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +57,12 @@ class BackgroundStore:
 
     def __init__(self, folder: Path) -> None:
         self._images = folder / "background.npz"
-        self._label = folder / "background.json"
+        self._label = StateFile(folder / "background.json")
 
     def load(self, place: Place) -> Reference | None:
         """The background of this place, or None when there is none, or another's, or a damaged one."""
-        try:
-            if self._label.stat().st_size > MAX_LABEL_BYTES:
-                return None
-            label = json.loads(self._label.read_bytes())
-        except (OSError, ValueError):
+        label = self._label.load(dict)
+        if label is None:
             return None
         if not place.fits(label):
             logger.info("the background in %s is that of another camera, profile or pose", self._images)
@@ -88,15 +82,14 @@ class BackgroundStore:
             self._images.parent.mkdir(parents=True, exist_ok=True)
             reference.save(self._images)
             label = {**place.label(), "sha256": _sha256(self._images), "frames": reference.frames}
-            partial = self._label.with_suffix(".partial")
-            partial.write_text(json.dumps(label))
-            partial.replace(self._label)
         except OSError as error:
             logger.warning("the background cannot be kept in %s: %s", self._images.parent, error)
+        else:
+            self._label.save(label)
 
     def drop(self) -> None:
         """Forget it."""
-        self._label.unlink(missing_ok=True)
+        self._label.drop()
         self._images.unlink(missing_ok=True)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 from edge_unit.client import MasterClient
 from shared.cell import Cell
 from shared.errors import CellwatchError, WireError
+from shared.files import write_whole
 from shared.messages import CellReference
 
 logger = logging.getLogger(__name__)
@@ -85,13 +86,13 @@ class CellCache:
 
     def _write(self, name: str, data: bytes) -> None:
         """Whole or not at all; a disk that is full costs the cache, not the unit."""
-        partial = self._folder / f"{name}.partial"
+        path = self._folder / name
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            partial.write_bytes(data)
-            partial.replace(self._folder / name)
+            # What a power cut damages is found by its hash and fetched again; a start waits for no disk.
+            write_whole(path, data, synced=False)
         except OSError as error:
-            logger.warning("%s: the cell cannot be kept: %s", partial, error)
+            logger.warning("%s: the cell cannot be kept: %s", path, error)
 
     def _keep_only(self, names: set[str]) -> None:
         try:

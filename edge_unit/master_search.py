@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import json
 import logging
 import ssl
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 from edge_unit.config import UnitConfig
@@ -21,6 +21,7 @@ from edge_unit.master_choice import Candidate, Kept, Place, Wanted, choose, dist
 from edge_unit.trust import tls_context
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.discovery import MAX_OFFERS, Browser, Offer, own_addresses
+from shared.files import StateFile
 from shared.waiting import within
 
 logger = logging.getLogger(__name__)
@@ -47,9 +48,6 @@ TELL_S = 10.0
 """Between lines in the journal about what is found; anyone on the network could have us write them."""
 
 FILE_NAME = "master.json"
-
-MAX_FILE_BYTES = 10_000
-"""Ten times what is written."""
 
 
 class MasterSearch:
@@ -235,34 +233,23 @@ async def reach(url: str, tls: ssl.SSLContext, source_address: str | None) -> st
 
 def load_kept(path: Path) -> Kept | None:
     """The master that answered last, or None; a damaged file is as good as none."""
-    try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise ValueError(f"expected at most {MAX_FILE_BYTES} bytes")
-        document = json.loads(path.read_text(encoding="utf-8"))
-        configured = document["configured"]
-        kept = Kept(
-            str(document["url"]),
-            str(document["cell"]),
-            str(document["found_by"]),
-            None if configured is None else str(configured),
-        )
-        parts = urlsplit(kept.url)
-        if parts.scheme not in ("http", "https") or not parts.hostname or parts.port is None:
-            raise ValueError(f"expected http://host:port, got {kept.url[:80]!r}")
-        return kept
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        logger.warning("%s: passed over: %s", path, " ".join(str(error).split()))
-        return None
+    return StateFile(path).load(_kept_of_document)
 
 
 def save_kept(path: Path, kept: Kept) -> None:
     """Remember a master; where nothing can be written nothing is remembered, and a warning says so."""
-    written = path.with_suffix(".new")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        written.write_text(json.dumps(dataclasses.asdict(kept)), encoding="utf-8")
-        written.replace(path)
-    except OSError as error:
-        logger.warning("%s: cannot be written: %s", path, error)
+    StateFile(path).save(dataclasses.asdict(kept))
+
+
+def _kept_of_document(document: Any) -> Kept:
+    configured = document["configured"]
+    kept = Kept(
+        str(document["url"]),
+        str(document["cell"]),
+        str(document["found_by"]),
+        None if configured is None else str(configured),
+    )
+    parts = urlsplit(kept.url)
+    if parts.scheme not in ("http", "https") or not parts.hostname or parts.port is None:
+        raise ValueError(f"expected http://host:port, got {kept.url[:80]!r}")
+    return kept

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from edge_unit.kernels import reference as kernels
 from shared.camera import Intrinsics
 from shared.errors import InputError
+from shared.files import write_whole
 
 SHARE_MIN = 0.15
 """Who walks through the picture covers a pixel for half a second; of ten seconds of learning that is 5 %. A surface
@@ -102,10 +103,12 @@ class Reference:
         return cls(np.ascontiguousarray(depth_m), np.ascontiguousarray(spread_m), frames)
 
     def save(self, path: Path) -> None:
-        """Write to `path`, whole or not at all."""
-        partial = path.with_suffix(".partial")
-        partial.write_bytes(self.to_bytes())
-        partial.replace(path)
+        """Write to `path`, whole or not at all.
+
+        Raises:
+            OSError: it cannot be written; what was there stays.
+        """
+        write_whole(path, self.to_bytes())
 
     @classmethod
     def load(cls, path: Path) -> Reference:

@@ -10,12 +10,12 @@ farther away, and hides as much from one place as from the next.
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from edge_unit.misfit import STEPS, Misfit
 from edge_unit.pipeline import DepthPipeline
 from shared.clock import NS_PER_S
+from shared.files import StateFile
 
 logger = logging.getLogger(__name__)
 
@@ -72,9 +73,6 @@ VALID_PART_MIN = 0.4
 """Of the share of pixels that is usually measured: with less, the lens is covered or dazzled."""
 
 FILE_NAME = "stance.json"
-
-MAX_FILE_BYTES = 10_000
-"""Some ten times what is written."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +125,8 @@ class Stance:
     """Judges one camera by how its frames fit what is known, against how they used to."""
 
     def __init__(self, state_dir: Path) -> None:
-        self._path = state_dir / FILE_NAME
+        self._file = StateFile(state_dir / FILE_NAME)
+        self._unsaved: dict[str, Any] | None = None
         self._place = ""
         self._layer = -1
         self._looks: deque[Misfit] = deque(maxlen=WINDOW)
@@ -143,7 +142,7 @@ class Stance:
         self._place, self._layer = place, -1
         self._looks.clear()
         self._gathered = _NOTHING
-        self._usual = self._load()
+        self._usual = self._file.load(self._fit_of)
         self._verdict = Verdict()
 
     def due(self, captured_at_ns: int) -> bool:
@@ -181,15 +180,26 @@ class Stance:
         """The last one."""
         return self._verdict
 
+    @property
+    def unsaved(self) -> bool:
+        """Whether there is something to `save`."""
+        return self._unsaved is not None
+
+    def save(self) -> None:
+        """Keep the usual fit for the next start; no frame should wait for it, for it takes as long as the disk does."""
+        document, self._unsaved = self._unsaved, None
+        if document is not None:
+            self._file.save(document)
+
     def _gather(self, look: Misfit) -> None:
-        """Learn the usual fit; it is kept whenever it rests on twice as many looks."""
+        """Learn the usual fit; it is to be kept whenever it rests on twice as many looks."""
         if self._gathered.looks == BASELINE_LOOKS_MAX:
             return
         self._gathered = fit = self._gathered.with_look(look)
         if fit.looks >= BASELINE_LOOKS:
             self._usual = fit
             if fit.looks % BASELINE_LOOKS == 0 and (fit.looks // BASELINE_LOOKS).bit_count() == 1:
-                self._save(fit)
+                self._unsaved = self._document(fit)
 
     def _judged(self, fit: _Fit, is_known: bool) -> Verdict:
         usual = self._usual
@@ -228,26 +238,17 @@ class Stance:
             return Verdict(warning=f"the pose seems {_words(off, worst)} off: have it refined, or calibrate")
         return Verdict()
 
-    def _load(self) -> _Fit | None:
-        try:
-            if self._path.stat().st_size > MAX_FILE_BYTES:
-                raise ValueError(f"expected at most {MAX_FILE_BYTES} bytes")
-            document = json.loads(self._path.read_text(encoding="utf-8"))
-            if document["place"] != self._place:
-                return None
-            slope, curvature = (np.array(document[name], np.float64) for name in ("slope", "curvature"))
-            if slope.shape != (6,) or curvature.shape != (6,):
-                raise ValueError("expected six axes")
-            shares = float(document["valid_share"]), float(document["beyond_share"])
-            return _Fit(int(document["looks"]), slope, curvature, *shares)
-        except FileNotFoundError:
+    def _fit_of(self, document: Any) -> _Fit | None:
+        if document["place"] != self._place:
             return None
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            logger.warning("%s: passed over: %s", self._path, " ".join(str(error).split()))
-            return None
+        slope, curvature = (np.array(document[name], np.float64) for name in ("slope", "curvature"))
+        if slope.shape != (6,) or curvature.shape != (6,):
+            raise ValueError("expected six axes")
+        shares = float(document["valid_share"]), float(document["beyond_share"])
+        return _Fit(int(document["looks"]), slope, curvature, *shares)
 
-    def _save(self, fit: _Fit) -> None:
-        document = {
+    def _document(self, fit: _Fit) -> dict[str, Any]:
+        return {
             "place": self._place,
             "looks": fit.looks,
             "slope": fit.slope.tolist(),
@@ -255,13 +256,6 @@ class Stance:
             "valid_share": fit.valid_share,
             "beyond_share": fit.beyond_share,
         }
-        written = self._path.with_suffix(".new")
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            written.write_text(json.dumps(document), encoding="utf-8")
-            written.replace(self._path)
-        except OSError as error:
-            logger.warning("%s: cannot be written: %s", self._path, error)
 
 
 def place_of(serial: str, profile: tuple[int, int], T_world_camera: NDArray[np.float64]) -> str:

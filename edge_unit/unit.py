@@ -273,6 +273,8 @@ class Unit:
         pipeline = self._assigned.pipeline
         if pipeline is not None and joints is not None and report.health.trouble is None:
             await self._joints.watch_delay(pipeline, frame)
+        if self._stance.unsaved:
+            self._errands.start(asyncio.to_thread(self._stance.save))
         gathered = self._refining.take()
         if gathered is not None:
             self._errands.start(self._refining.refine(gathered))

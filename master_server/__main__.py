@@ -49,6 +49,7 @@ from shared.clock import monotonic_ns
 from shared.configuration import assignments, load
 from shared.discovery import Announcement, Announcer, only_loopback
 from shared.errors import CellwatchError, ConfigError
+from shared.files import write_whole
 from shared.messages import CONTRACT_VERSION
 from shared.service import ServiceManager
 
@@ -121,9 +122,7 @@ class _Server(uvicorn.Server):
         gc.freeze()
         text = json.dumps(self._ready)
         if self._ready_file is not None:
-            partial = self._ready_file.with_suffix(".partial")
-            partial.write_text(text + "\n")
-            partial.replace(self._ready_file)
+            write_whole(self._ready_file, f"{text}\n".encode(), synced=False)
         print(f"master-server: listening at {self._ready['url']}{self._everywhere}", flush=True)
         for role in Role:
             lies_in = self._ready[f"{role.value}_token_file"]

@@ -5,7 +5,7 @@ In the order of the flow:
 
     errors         the one tree of errors that the project raises
     configuration  YAML, environment and command line as one configuration
-    files          files of which a power cut leaves all or nothing
+    files          files of which a power cut leaves all or nothing, and state in them
     clock          the only place that reads the time
     waiting        waiting with a limit, without losing a cancellation
     service        what the service manager that started this process is told

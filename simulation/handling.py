@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from shared.configuration import sentence
 from shared.errors import SourceError
+from shared.files import write_whole
 
 
 class Handling(BaseModel):
@@ -30,9 +31,7 @@ class Handling(BaseModel):
 
     def write(self, path: Path) -> None:
         """From now on this is done to the camera that looks at `path`."""
-        written = path.with_suffix(".new")
-        written.write_text(self.model_dump_json(), encoding="utf-8")
-        written.replace(path)
+        write_whole(path, self.model_dump_json().encode(), synced=False)
 
 
 LEFT_ALONE = Handling()

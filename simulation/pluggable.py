@@ -19,6 +19,7 @@ import pyrealsense2 as rs
 from edge_unit.sources import capture_link as link
 from edge_unit.sources.capture import Capture
 from edge_unit.sources.capture_process import main
+from shared.files import write_whole
 
 LOOK_EVERY_S = 0.02
 
@@ -30,9 +31,7 @@ def command(sockets: Path) -> tuple[str, ...]:
 
 def plug(sockets: Path, recordings: Iterable[Path]) -> None:
     """From now on these recordings are plugged in, and no other."""
-    written = sockets.with_suffix(".new")
-    written.write_text("".join(f"{recording}\n" for recording in recordings))
-    written.rename(sockets)
+    write_whole(sockets, "".join(f"{recording}\n" for recording in recordings).encode(), synced=False)
 
 
 class Sockets:

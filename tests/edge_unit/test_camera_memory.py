@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from edge_unit.camera_memory import MAX_FILE_BYTES, CameraMemory
+from edge_unit.camera_memory import CameraMemory
 from edge_unit.sources.frame import CameraInfo
 from shared.camera import Intrinsics
+from shared.files import STATE_MAX_BYTES
 
 CAMERA = CameraInfo("123", "D435", Intrinsics(848, 480, 424.1, 424.2, 423.9, 239.8, 0.00025, 0.0501, 420.0))
 
@@ -39,4 +40,4 @@ def test_what_cannot_be_written_is_a_warning(tmp_path: Path, caplog: pytest.LogC
 
 def test_what_is_written_can_be_read(tmp_path: Path) -> None:
     CameraMemory(tmp_path).save(CAMERA)
-    assert (tmp_path / "camera.json").stat().st_size < MAX_FILE_BYTES / 5
+    assert (tmp_path / "camera.json").stat().st_size < STATE_MAX_BYTES / 5

@@ -48,6 +48,7 @@ class Watched:
             depth[:, round(share * EYE.width) :] = 0
             self.pipeline.process(depth, frame.joints)
             yield self.stance.judge(self.pipeline.misfit(), self.pipeline.static_version, round(self.t_s * 1e9))
+            self.stance.save()
             self.t_s += PERIOD_S
 
     def last(self, count: int, knock: Transform = HERE, share: float = 1.0) -> Verdict:

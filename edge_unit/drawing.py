@@ -30,10 +30,11 @@ early: a robot that stops and goes by turns would have everything drawn twice.""
 class DepthBuffer:
     """Nearest and farthest inverse depth, 1/m, of a window of the picture, as `rasterize` has it."""
 
-    def __init__(self, intrinsics: Intrinsics) -> None:
+    def __init__(self, intrinsics: Intrinsics, farthest: bool = False) -> None:
+        """Without `farthest` only the nearest is drawn."""
         size = intrinsics.height * (intrinsics.width + rasterize.LANES) + rasterize.LANES
         self.nearest_w = np.zeros(size, np.float32)
-        self.farthest_w = np.zeros(size, np.float32)
+        self.farthest_w = np.zeros(size if farthest else 0, np.float32)
         self.window = np.zeros(4, np.int64)
 
     def nearest_in(self, picture_w: NDArray[np.float32], rectangles: NDArray[np.int32]) -> None:
@@ -123,11 +124,14 @@ class LinkDrawing:
         buffer: what was drawn last.
     """
 
-    def __init__(self, intrinsics: Intrinsics, meshes: Sequence[TriangleMesh], inflate: bool) -> None:
+    def __init__(
+        self, intrinsics: Intrinsics, meshes: Sequence[TriangleMesh], inflate: bool, farthest: bool = False
+    ) -> None:
+        """`inflate` as for a `MeshBatch`, `farthest` as for a `DepthBuffer`."""
         self._batch = MeshBatch(intrinsics, meshes, inflate)
         self._reach_m = np.array([float(np.linalg.norm(mesh.vertices, axis=1).max()) for mesh in meshes])
-        self.buffer = DepthBuffer(intrinsics)
-        self._kept = DepthBuffer(intrinsics)
+        self.buffer = DepthBuffer(intrinsics, farthest)
+        self._kept = DepthBuffer(intrinsics, farthest)
         self._is_kept = np.zeros(self._batch.count, np.bool_)
         self._is_drawn = np.zeros(self._batch.count, np.bool_)
         self._still_for = np.zeros(self._batch.count, np.int64)

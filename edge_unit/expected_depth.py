@@ -8,7 +8,6 @@ only inside the rectangles of its links, as solids that are its padding larger, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,9 +77,9 @@ class RobotLayer:
         """`padding_m` is what the links are usually drawn with: they are prepared for it."""
         self._intrinsics = intrinsics
         self._hull_m = max(padding_m, DISTANCE_MIN_M)
+        hulls = [hull_around(link.mesh, self._hull_m) for link in robot.links] if robot else []
         # With their backs: a link that points at the camera is as deep as it is long.
-        hulls = [replace(hull_around(link.mesh, self._hull_m), closed=False) for link in robot.links] if robot else []
-        self._drawing = LinkDrawing(intrinsics, hulls, inflate=True)
+        self._drawing = LinkDrawing(intrinsics, hulls, inflate=True, farthest=True)
         self._is_shown = False
         self.padding_m = np.full(len(hulls), padding_m, np.float32)
         self.near_raw = np.full(intrinsics.shape, limits.RAW_MAX, np.uint16)

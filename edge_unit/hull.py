@@ -31,8 +31,12 @@ GRID_NODES_MAX = 2_000_000
 SAMPLE_SHARE = 0.1
 """Spacing of the points that stand for the mesh in parts of the distance; it changes that by less than a hundredth."""
 
-SIMPLIFY_M = 0.001
-"""How far the simplified hull may leave the grid's."""
+SIMPLIFY_MAX_M, SIMPLIFY_SHARE = 0.002, 1.0 / 15.0
+"""How far the simplified hull may leave the grid's, in all and in parts of the distance: a millimetre less would double
+what its drawing costs."""
+
+LIFT = 0.25
+"""By this part of it the hull is made larger beforehand: triangles between fewer corners cut off what is round."""
 
 HULLS_MAX = 64
 """Hulls kept for meshes met again, as when the cell is sent anew: two arms with their tools."""
@@ -64,13 +68,15 @@ def _make_hull(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
     size = mesh.vertices.max(axis=0) + np.float32(distance_m + 3.0 * grid_m) - low
     grid_m = max(grid_m, float((np.prod(size) / GRID_NODES_MAX) ** (1.0 / 3.0)))
     shape = np.ceil(size / grid_m).astype(int) + 1
-    field = _distance(mesh, low, shape, grid_m, distance_m) - np.float32(distance_m)
+    simplify_m = min(SIMPLIFY_MAX_M, SIMPLIFY_SHARE * distance_m)
+    lifted_m = distance_m + LIFT * simplify_m
+    field = _distance(mesh, low, shape, grid_m, lifted_m) - np.float32(lifted_m)
     outside = np.empty(field.shape, np.bool_)
     kernels.flood_outside(field < 0.0, outside, np.empty(field.size, np.int64))
     # A cavity is inside, too.
     field[~outside & (field >= 0.0)] = -grid_m
     vertices, faces = _surface(field)
-    return _simplified(mesh.name, (vertices * np.float32(grid_m) + low).astype(np.float32), faces)
+    return _simplified(mesh.name, (vertices * np.float32(grid_m) + low).astype(np.float32), faces, simplify_m)
 
 
 def _distance(
@@ -101,11 +107,13 @@ def _surface(field: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[n
     return vertices, faces
 
 
-def _simplified(name: str, vertices_m: NDArray[np.float32], faces: NDArray[np.int32]) -> TriangleMesh:
-    """With as few triangles as `SIMPLIFY_M` allows."""
+def _simplified(
+    name: str, vertices_m: NDArray[np.float32], faces: NDArray[np.int32], tolerance_m: float
+) -> TriangleMesh:
+    """With as few triangles as `tolerance_m` allows."""
     solid = manifold3d.Manifold(manifold3d.Mesh(vertices_m, faces.astype(np.uint32)))
     if solid.status() == manifold3d.Error.NoError and solid.num_tri() > 0:
-        found = solid.simplify(SIMPLIFY_M).to_mesh()
+        found = solid.simplify(tolerance_m).to_mesh()
         vertices_m = np.ascontiguousarray(found.vert_properties[:, :3], np.float32)
         faces = np.ascontiguousarray(found.tri_verts, np.int32)
     else:

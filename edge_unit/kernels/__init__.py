@@ -5,6 +5,7 @@ They import only numpy, numba, math and one another; each has a slow twin in pla
 In the order of the flow:
 
     jit         how kernels are compiled
+    int32       integers of 32 bits that stay so
     forward     where the links stand, and how far they may be off (Algorithm 5)
     motion      which links have moved since they were drawn
     project     where meshes come to lie on the screen

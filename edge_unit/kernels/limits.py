@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.kernels.jit import kernel
-from edge_unit.kernels.rasterize import span_of_row
+from edge_unit.kernels.rasterize import NOTHING_FARTHEST, NOTHING_NEAREST, span_of_row
 
 RAW_MAX = 65535
 """The largest raw depth."""
@@ -104,15 +104,18 @@ def band_of_row(
 ) -> None:
     """One stretch of a row of `robot_band_raw`; written for the vectoriser: no branch, one type, nothing but arrays."""
     for i in range(len(nearest_w)):
-        w = nearest_w[i]
-        z_near = ONE / w
-        z_far = max(ONE / farthest_w[i], z_near + depth_m)
+        nearest, farthest = nearest_w[i], farthest_w[i]
+        # A back without a front: the front lies before the near plane, and the camera in the padding.
+        within = (nearest == NOTHING_NEAREST) & (farthest > NOTHING_FARTHEST)
+        z_near = ZERO if within else ONE / nearest
+        z_far = max(-ONE / farthest, z_near + depth_m)
         near = min(max((z_near - noise_per_m * z_near * z_near) * units_per_m, ZERO), TOP)
         far = min(max((z_far + noise_per_m * z_far * z_far) * units_per_m, ZERO), TOP)
         low = np.int32(near)
-        # Where nothing was drawn w is 0 and the above is nonsense.
-        near_raw[i] = np.uint16(low) if w > ZERO else np.uint16(RAW_MAX)
-        span_raw[i] = np.uint16(np.int32(far) - low) if w > ZERO else np.uint16(0)
+        # Where nothing was drawn the above is nonsense.
+        drawn = (nearest > NOTHING_NEAREST) | within
+        near_raw[i] = np.uint16(low) if drawn else np.uint16(RAW_MAX)
+        span_raw[i] = np.uint16(np.int32(far) - low) if drawn else np.uint16(0)
 
 
 @kernel
@@ -131,8 +134,9 @@ def robot_band_raw(
 ) -> None:
     """The band of raw depths in which a measurement belongs to the robot, as `rasterize.draw_meshes` has drawn it.
 
-    From the nearest padded surface less its noise margin to the farthest one, links' backs included, or `depth_m`
-    behind the nearest if that is farther, plus the margin there: what stands behind the robot is still seen. The band
+    From the nearest padded surface less its noise margin, or from 0 where the camera stands in the padding, to the
+    farthest one, or `depth_m` behind the nearest if that is farther, plus the margin there: what stands behind the
+    robot is still seen. The band
     is stored as its lower end and its length, so that the filter needs one unsigned compare. Where there is no robot
     it is empty: its lower end is where no limit reaches. `columns` (H, 2) holds of each row the first column and the
     one after the last that the images `near_raw` and `span_raw` (H, W) have a band in; it is renewed, and what was

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Meshes onto the screen: a z-buffer of inverse depth (the paper's Algorithms 2 to 4).
 
-What is linear on the screen is 1/z, not z; so the buffers hold `w = 1/z` (1/m): the nearest surface
-has the largest w, and 0 means that nothing stands there. Pixel centres are at integer coordinates.
+What is linear on the screen is 1/z, not z; so the buffers hold `w = 1/z` (1/m): the nearest surface has the largest w,
+and 0 means that nothing stands there. The farthest surface is kept as `-w`, so that of either the largest counts.
+A closed mesh shows its nearest surface by the faces that are turned here, and its farthest by those turned away: each
+of its triangles is drawn into one buffer only.
 
 A buffer holds only a *window* of the picture, the rectangle about all that is drawn: thirty times a second it comes
 from cold memory, where few pages in a row are fetched several times as fast as many scattered ones. Window (4,):
@@ -19,14 +21,15 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_unit.kernels.int32 import add, multiply, none_negative
 from edge_unit.kernels.jit import kernel
 from edge_unit.kernels.project import SUBPIXELS, clip, corners_of, place_meshes
 
 NOTHING_NEAREST = np.float32(0.0)
 """`nearest_w` of a pixel without a surface: infinitely far."""
 
-NOTHING_FARTHEST = np.float32(1e6)
-"""`farthest_w` of a pixel without a surface: a micrometre away, so that any surface is farther. Not the largest
+NOTHING_FARTHEST = np.float32(-1e6)
+"""`farthest_w` of a pixel without a surface: a micrometre away, so that any surface is farther. Not the least
 float32: its inverse is subnormal, which costs a hundred cycles a pixel."""
 
 LANES = 16
@@ -37,9 +40,12 @@ SMALL_ROWS = 96
 """Triangles up to twice `LANES` wide and so many rows high are drawn with integers of 32 bits. An edge's function is
 the difference of two products, at most (32 + 16) * 96 + 32 * 96 pixels in units of 1/512 squared: 2.01e9 of 2.15e9."""
 
-UNSEEN, SMALL, WIDE, LARGE = 0, 1, 2, 3
-"""What is done with a triangle: nothing, for it is turned away or holds no pixel centre; or how it is drawn: at once
-when no wider than `LANES`, in two halves when no wider than twice that, or span by span."""
+UNSEEN, SMALL, LARGE = 0, 1, 2
+"""What is done with a triangle: nothing, for it is not wanted or holds no pixel centre; or how it is drawn: by integers
+when no wider than twice `LANES` and no higher than `SMALL_ROWS`, else span by span."""
+
+AWAY = 4
+"""Added to it when the triangle is turned away."""
 
 
 @kernel
@@ -49,17 +55,16 @@ def sort_faces(
     c: NDArray[np.int32],
     u_px: NDArray[np.float32],
     v_px: NDArray[np.float32],
-    closed: bool,
+    with_away: bool,
     last_column: np.float32,
     last_row: np.float32,
     kinds: NDArray[np.uint8],
 ) -> None:
     """What is to be done with each triangle, all of whose corners lie beyond the near plane.
 
-    Written for the vectoriser: no branch. Faces turned away are left out when the mesh is `closed` (Algorithm 3).
+    Written for the vectoriser: no branch. Faces turned away are left out unless they are wanted (Algorithm 3).
     """
-    zero, width, height = np.float32(0.0), np.float32(LANES - 1), np.float32(SMALL_ROWS - 1)
-    twice = np.float32(2 * LANES - 1)
+    zero, width, height = np.float32(0.0), np.float32(2 * LANES - 1), np.float32(SMALL_ROWS - 1)
     for f in range(len(a)):
         i, j, k = np.uint32(a[f]), np.uint32(b[f]), np.uint32(c[f])
         u0, u1, u2 = u_px[i], u_px[j], u_px[k]
@@ -69,12 +74,11 @@ def sort_faces(
         holds_column = np.ceil(max(left, zero)) <= np.floor(min(right, last_column))
         holds_row = np.ceil(max(top, zero)) <= np.floor(min(bottom, last_row))
         double_area = np.float64(u1 - u0) * np.float64(v2 - v0) - np.float64(u2 - u0) * np.float64(v1 - v0)
-        turned_here = (double_area < 0.0) | ((not closed) & (double_area > 0.0))
-        seen = holds_column & holds_row & turned_here
-        low = bottom - top <= height
-        narrow, wide = low & (right - left <= width), low & (right - left <= twice)
+        away = with_away & (double_area > 0.0)
+        seen = holds_column & holds_row & ((double_area < 0.0) | away)
+        large = (bottom - top > height) | (right - left > width)
         # UNSEEN and one more for each step; a choice between constants would not be vectorised.
-        kinds[f] = np.uint8(seen) + np.uint8(seen & (not narrow)) + np.uint8(seen & (not wide))
+        kinds[f] = np.uint8(seen) + np.uint8(seen & large) + np.uint8(AWAY) * np.uint8(seen & away)
 
 
 @kernel
@@ -86,7 +90,10 @@ def sort_cut_faces(
     near_m: np.float32,
     kinds: NDArray[np.uint8],
 ) -> None:
-    """Mend `kinds` where a corner lies before the near plane: such a triangle is cut, or not seen at all."""
+    """Mend `kinds` where a corner lies before the near plane: such a triangle is cut, or not seen at all.
+
+    Where it is turned is told when it is cut.
+    """
     for f in range(len(a)):
         beyond = 0
         beyond += camera_z_m[a[f]] >= near_m
@@ -98,28 +105,28 @@ def sort_cut_faces(
 
 @kernel
 def list_faces(
-    kinds: NDArray[np.uint8], small: NDArray[np.int32], wide: NDArray[np.int32], large: NDArray[np.int32]
+    kinds: NDArray[np.uint8], here: NDArray[np.int32], away: NDArray[np.int32], large: NDArray[np.int32]
 ) -> tuple[int, int, int]:
-    """The numbers of the small and wide, of the wide, and of the large triangles; returns how many of each."""
+    """The numbers of the small triangles turned here, of those turned away, and of the large; how many of each."""
     # Unsigned, for a signed index is tested for counting from the end.
-    smalls, wides, larges = np.uint64(0), np.uint64(0), np.uint64(0)
+    heres, aways, larges = np.uint64(0), np.uint64(0), np.uint64(0)
     for f in range(len(kinds)):
         # Written always and kept when it is one: a branch would be guessed wrong too often.
-        small[smalls] = f
-        wide[wides] = f
+        here[heres] = f
+        away[aways] = f
         large[larges] = f
         kind = kinds[f]
-        smalls += np.uint64((kind == SMALL) | (kind == WIDE))
-        wides += np.uint64(kind == WIDE)
-        larges += np.uint64(kind == LARGE)
+        heres += np.uint64(kind == SMALL)
+        aways += np.uint64(kind == SMALL + AWAY)
+        larges += np.uint64((kind == LARGE) | (kind == LARGE + AWAY))
     # To numba they are plain numbers.
-    return np.int64(smalls), np.int64(wides), np.int64(larges)  # type: ignore[return-value]
+    return np.int64(heres), np.int64(aways), np.int64(larges)  # type: ignore[return-value]
 
 
 @kernel
 def fill_small(
     faces: NDArray[np.int32],
-    from_column: np.float32,
+    sign: np.float32,
     a: NDArray[np.int32],
     b: NDArray[np.int32],
     c: NDArray[np.int32],
@@ -129,10 +136,9 @@ def fill_small(
     width: int,
     height: int,
     window: NDArray[np.int64],
-    nearest_w: NDArray[np.float32],
-    farthest_w: NDArray[np.float32],
+    buffer_w: NDArray[np.float32],
 ) -> None:
-    """Draw `LANES` columns, from each one's column `from_column` on, of the triangles whose numbers are `faces`.
+    """Draw the small triangles whose numbers are `faces`: the largest of `sign * w`, which is 1 for the nearest.
 
     A pixel is drawn when its centre is on the inner side of all three edges, or on one: neighbours leave no gap, for
     integers do not round.
@@ -146,13 +152,12 @@ def fill_small(
         i, j, k = np.uint32(a[f]), np.uint32(b[f]), np.uint32(c[f])
         u0, u1, u2 = u_px[i], u_px[j], u_px[k]
         v0, v1, v2 = v_px[i], v_px[j], v_px[k]
-        w0, w1, w2 = w_per_m[i], w_per_m[j], w_per_m[k]
-        u_left = np.ceil(max(min(u0, min(u1, u2)), zero)) + from_column
+        w0, w1, w2 = sign * w_per_m[i], sign * w_per_m[j], sign * w_per_m[k]
+        u_left = np.ceil(max(min(u0, min(u1, u2)), zero))
         v_top = np.ceil(max(min(v0, min(v1, v2)), zero))
         left, top = np.int32(u_left), np.int32(v_top)
         right = np.int32(min(max(u0, max(u1, u2)), last_column))
-        # The picture's edge may have cut off the columns that are asked for.
-        bottom = np.int32(min(max(v0, max(v1, v2)), last_row)) if left <= right else top - 1
+        bottom = np.int32(min(max(v0, max(v1, v2)), last_row))
         # From here on in subpixels from the first pixel.
         x0, y0 = np.int32((u0 - u_left) * SUBPIXELS), np.int32((v0 - v_top) * SUBPIXELS)
         x1, y1 = np.int32((u1 - u_left) * SUBPIXELS), np.int32((v1 - v_top) * SUBPIXELS)
@@ -175,27 +180,27 @@ def fill_small(
         w_low, w_high = min(w0, min(w1, w2)), max(w0, max(w1, w2))
         w = w0 + (u_left - u0) * w_per_u + (v_top - v0) * w_per_v
         at = np.uint64((top - first_row) * stride + left - first_column)
-        for _ in range(bottom - top + 1):
-            # Two loops, each with one array: with two in one, the vectoriser would have to ask whether they overlap.
-            for lane in range(LANES):
-                x = np.int32(lane)
-                outside = (
-                    np.int32(edge_0 + x * per_x_0) | np.int32(edge_1 + x * per_x_1) | np.int32(edge_2 + x * per_x_2)
-                )
-                here = min(max(w + np.float32(x) * w_per_u, w_low), w_high)
-                before = nearest_w[at + np.uint64(lane)]
-                nearest_w[at + np.uint64(lane)] = here if (outside >= 0) & (here > before) else before
-            for lane in range(LANES):
-                x = np.int32(lane)
-                outside = (
-                    np.int32(edge_0 + x * per_x_0) | np.int32(edge_1 + x * per_x_1) | np.int32(edge_2 + x * per_x_2)
-                )
-                here = min(max(w + np.float32(x) * w_per_u, w_low), w_high)
-                before = farthest_w[at + np.uint64(lane)]
-                farthest_w[at + np.uint64(lane)] = here if (outside >= 0) & (here < before) else before
-            edge_0, edge_1, edge_2 = np.int32(edge_0 + per_y_0), np.int32(edge_1 + per_y_1), np.int32(edge_2 + per_y_2)
-            w += w_per_v
-            at += np.uint64(stride)
+        for part in range(0, right - left + 1, LANES):
+            shift = np.int32(part)
+            here_0 = np.int32(edge_0 + shift * per_x_0)
+            here_1 = np.int32(edge_1 + shift * per_x_1)
+            here_2 = np.int32(edge_2 + shift * per_x_2)
+            here_w = w + np.float32(shift) * w_per_u
+            row = at + np.uint64(part)
+            for _ in range(bottom - top + 1):
+                for lane in range(LANES):
+                    x = np.int32(lane)
+                    inside = none_negative(
+                        add(here_0, multiply(x, per_x_0)),
+                        add(here_1, multiply(x, per_x_1)),
+                        add(here_2, multiply(x, per_x_2)),
+                    )
+                    here = min(max(here_w + np.float32(x) * w_per_u, w_low), w_high)
+                    before = buffer_w[row + np.uint64(lane)]
+                    buffer_w[row + np.uint64(lane)] = here if inside & (here > before) else before
+                here_0, here_1, here_2 = add(here_0, per_y_0), add(here_1, per_y_1), add(here_2, per_y_2)
+                here_w += w_per_v
+                row += np.uint64(stride)
 
 
 @kernel
@@ -212,10 +217,9 @@ def fill_triangle(
     width: int,
     height: int,
     window: NDArray[np.int64],
-    nearest_w: NDArray[np.float32],
-    farthest_w: NDArray[np.float32],
+    buffer_w: NDArray[np.float32],
 ) -> None:
-    """Draw one triangle of any size, given by pixel coordinates and inverse depth of its corners.
+    """Draw one triangle of any size, given by pixel coordinates and w of its corners: the largest w.
 
     Every pixel centre on or inside an edge is drawn, and the crossing of an edge with a row is reckoned from its
     upper end whichever triangle it belongs to: neighbours leave no gap.
@@ -255,41 +259,86 @@ def fill_triangle(
         w_last = min(max(np.float32(w_row + (last - u0) * w_per_u), w_low), w_high)
         step = (w_last - w) / np.float32(max(last - first, 1))
         at = (y - window[0]) * window[3] + first - window[1]
-        nearest_row = nearest_w[at : at + last + 1 - first]
-        for x in range(len(nearest_row)):
+        buffer_row = buffer_w[at : at + last + 1 - first]
+        for x in range(len(buffer_row)):
             here = w + np.float32(x) * step
-            nearest_row[x] = here if here > nearest_row[x] else nearest_row[x]
-        farthest_row = farthest_w[at : at + last + 1 - first]
-        for x in range(len(farthest_row)):
-            here = w + np.float32(x) * step
-            farthest_row[x] = here if here < farthest_row[x] else farthest_row[x]
+            buffer_row[x] = here if here > buffer_row[x] else buffer_row[x]
 
 
 @kernel
 def fill_clipped(
     corners: NDArray[np.float32],
     polygon: NDArray[np.float64],
-    cull: bool,
+    with_here: bool,
+    with_away: bool,
+    sign: np.float32,
     camera: NDArray[np.float32],
     width: int,
     height: int,
     window: NDArray[np.int64],
-    nearest_w: NDArray[np.float32],
-    farthest_w: NDArray[np.float32],
+    buffer_w: NDArray[np.float32],
 ) -> None:
     """Draw what lies beyond the near plane of a triangle with corners (3, 3) in the camera frame; `polygon` (4, 3)."""
     for i in range(1, clip(corners, camera, polygon) - 1):
         u0, v0 = polygon[0, 0], polygon[0, 1]
         u1, v1 = polygon[i, 0], polygon[i, 1]
         u2, v2 = polygon[i + 1, 0], polygon[i + 1, 1]
-        if cull and (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0) >= 0.0:
-            continue
-        fill_triangle(
-            u0, v0, polygon[0, 2],
-            u1, v1, polygon[i, 2],
-            u2, v2, polygon[i + 1, 2],
-            width, height, window, nearest_w, farthest_w,
-        )  # fmt: skip
+        double_area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
+        if (with_here and double_area < 0.0) or (with_away and double_area > 0.0):
+            fill_triangle(
+                u0, v0, sign * polygon[0, 2],
+                u1, v1, sign * polygon[i, 2],
+                u2, v2, sign * polygon[i + 1, 2],
+                width, height, window, buffer_w,
+            )  # fmt: skip
+
+
+@kernel
+def fill_large(
+    faces: NDArray[np.int32],
+    kinds: NDArray[np.uint8],
+    with_here: bool,
+    with_away: bool,
+    sign: np.float32,
+    a: NDArray[np.int32],
+    b: NDArray[np.int32],
+    c: NDArray[np.int32],
+    before: int,
+    u_px: NDArray[np.float32],
+    v_px: NDArray[np.float32],
+    w_per_m: NDArray[np.float32],
+    x_m: NDArray[np.float32],
+    y_m: NDArray[np.float32],
+    z_m: NDArray[np.float32],
+    camera: NDArray[np.float32],
+    width: int,
+    height: int,
+    window: NDArray[np.int64],
+    corners: NDArray[np.float32],
+    polygon: NDArray[np.float64],
+    buffer_w: NDArray[np.float32],
+) -> None:
+    """Draw those of the large triangles whose numbers are `faces` that are turned as wanted, `sign` as in `fill_small`.
+
+    They belong to a mesh `before` of whose vertices lie before the near plane.
+    """
+    near_m = camera[4]
+    for n in range(len(faces)):
+        f = faces[n]
+        i, j, k = a[f], b[f], c[f]
+        if before > 0 and (z_m[i] < near_m or z_m[j] < near_m or z_m[k] < near_m):
+            corners_of(i, j, k, x_m, y_m, z_m, corners)
+            fill_clipped(
+                corners, polygon, with_here, with_away, sign, camera, width, height, window, buffer_w
+            )  # fmt: skip
+        elif with_away if kinds[f] >= AWAY else with_here:
+            # In float64 as after clipping, so that neighbours agree on where their edge crosses a row.
+            fill_triangle(
+                np.float64(u_px[i]), np.float64(v_px[i]), np.float64(sign * w_per_m[i]),
+                np.float64(u_px[j]), np.float64(v_px[j]), np.float64(sign * w_per_m[j]),
+                np.float64(u_px[k]), np.float64(v_px[k]), np.float64(sign * w_per_m[k]),
+                width, height, window, buffer_w,
+            )  # fmt: skip
 
 
 @kernel
@@ -317,31 +366,26 @@ def fill_mesh(
     farthest_w: NDArray[np.float32],
 ) -> None:
     """Draw one of the meshes of `draw_meshes`, `before` of whose vertices lie before the near plane."""
-    near_m = camera[4]
-    sort_faces(a, b, c, u_px, v_px, closed, np.float32(width - 1), np.float32(height - 1), kinds)
+    with_away = not closed or len(farthest_w) > 0
+    sort_faces(a, b, c, u_px, v_px, with_away, np.float32(width - 1), np.float32(height - 1), kinds)
     if before > 0:
-        sort_cut_faces(a, b, c, z_m, near_m, kinds)
-    smalls, wides, larges = list_faces(kinds, lists[0], lists[1], lists[2])
-    fill_small(
-        lists[0, :smalls], np.float32(0.0), a, b, c, u_px, v_px, w_per_m, width, height, window, nearest_w, farthest_w
-    )  # fmt: skip
-    fill_small(
-        lists[1, :wides], np.float32(LANES), a, b, c, u_px, v_px, w_per_m, width, height, window, nearest_w, farthest_w
-    )  # fmt: skip
-    for n in range(larges):
-        f = lists[2, n]
-        i, j, k = a[f], b[f], c[f]
-        if before > 0 and (z_m[i] < near_m or z_m[j] < near_m or z_m[k] < near_m):
-            corners_of(i, j, k, x_m, y_m, z_m, corners)
-            fill_clipped(corners, polygon, closed, camera, width, height, window, nearest_w, farthest_w)
-        else:
-            # In float64 as after clipping, so that neighbours agree on where their edge crosses a row.
-            fill_triangle(
-                np.float64(u_px[i]), np.float64(v_px[i]), np.float64(w_per_m[i]),
-                np.float64(u_px[j]), np.float64(v_px[j]), np.float64(w_per_m[j]),
-                np.float64(u_px[k]), np.float64(v_px[k]), np.float64(w_per_m[k]),
-                width, height, window, nearest_w, farthest_w,
-            )  # fmt: skip
+        sort_cut_faces(a, b, c, z_m, camera[4], kinds)
+    heres, aways, larges = list_faces(kinds, lists[0], lists[1], lists[2])
+    here, away, large = lists[0, :heres], lists[1, :aways], lists[2, :larges]
+    for side in range(2):
+        buffer_w = nearest_w if side == 0 else farthest_w
+        if len(buffer_w) == 0:
+            continue
+        sign = np.float32(1.0) if side == 0 else np.float32(-1.0)
+        with_here, with_away = not closed or side == 0, not closed or side == 1
+        if with_here:
+            fill_small(here, sign, a, b, c, u_px, v_px, w_per_m, width, height, window, buffer_w)
+        if with_away:
+            fill_small(away, sign, a, b, c, u_px, v_px, w_per_m, width, height, window, buffer_w)
+        fill_large(
+            large, kinds, with_here, with_away, sign, a, b, c, before, u_px, v_px, w_per_m, x_m, y_m, z_m,
+            camera, width, height, window, corners, polygon, buffer_w,
+        )  # fmt: skip
 
 
 @kernel
@@ -384,7 +428,8 @@ def open_window(
         first, end = span_of_row(y, rectangles, chosen, others)
         at = (y - first_row) * window[3] - first_column
         nearest_w[at + first : at + end] = NOTHING_NEAREST
-        farthest_w[at + first : at + end] = NOTHING_FARTHEST
+        if len(farthest_w) > 0:
+            farthest_w[at + first : at + end] = NOTHING_FARTHEST
 
 
 @kernel
@@ -404,7 +449,8 @@ def copy_window(
         source = (y - from_window[0]) * from_window[3] - from_window[1]
         at = (y - window[0]) * window[3] - window[1]
         nearest_w[at + first : at + end] = from_nearest_w[source + first : source + end]
-        farthest_w[at + first : at + end] = from_farthest_w[source + first : source + end]
+        if len(farthest_w) > 0:
+            farthest_w[at + first : at + end] = from_farthest_w[source + first : source + end]
 
 
 @kernel
@@ -438,9 +484,11 @@ def draw_meshes(
 ) -> None:
     """Draw the `chosen` (M,) of M meshes over what is kept of the `others`, into nearest and farthest inverse depth.
 
-    Meshes, poses and `rectangles` as in `project.place_meshes`. Faces turned away are left out where a mesh is `closed`
-    (M,) (Algorithm 3). The buffers of 1/m hold, where a rectangle reaches, `window` of the picture, which is laid anew;
-    they have room for H * (W + LANES) + LANES pixels. `farthest_w` is of the farthest *drawn* surface.
+    Meshes, poses and `rectangles` as in `project.place_meshes`. Where a mesh is `closed` (M,), only faces turned here
+    (Algorithm 3) are drawn into `nearest_w`, and only those turned away into `farthest_w`. The buffers of 1/m hold,
+    where a rectangle reaches, `window` of the picture, which is laid anew; they have room for H * (W + LANES) + LANES
+    pixels. Where the near plane cuts away the front of a closed mesh, there may be a farthest surface without a
+    nearest. `farthest_w`, kept and new, may be empty: then none is drawn.
     Scratch: `placed` (6, V), `before` (M,), `kinds` (most faces of a mesh,), `lists` (3, most faces + 1),
     `corners` (3, 3), `polygon` (4, 3).
     """

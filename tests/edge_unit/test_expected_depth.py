@@ -211,6 +211,25 @@ def test_the_band_is_that_of_rays_on_the_inflated_hulls() -> None:
     assert (np.abs(high_m - (far_m + NOISE_PER_M * far_m**2)) <= 0.003).mean() > 0.99
 
 
+def test_from_within_the_padding_all_is_robot_up_to_the_links_back() -> None:
+    """The arm points away from the camera, which it begins 30 mm before."""
+    arm = Arm()
+    poses = np.stack((np.eye(4), from_xyz_rpy((0.0, 0.0, 0.03), (0.0, -np.pi / 2, 0.0))))
+    padding_m = np.full(2, PADDING_M, np.float32)
+    assert arm.layer.draw(poses, padding_m, NOISE_PER_M, DEPTH_M, np.array([True, False]))
+    middle = (120, 212)
+    assert arm.layer.near_raw[middle] == 0
+    assert arm.layer.span_raw[middle] == pytest.approx(1000.0 * (0.43 + PADDING_M + NOISE_PER_M * 0.48**2), abs=5.0)
+
+
+def test_from_outside_the_padding_no_pixel_has_a_back_without_a_front() -> None:
+    """At silhouettes triangles turned here and turned away cover the same pixels."""
+    arm = Arm()
+    for angle in np.linspace(0.0, 2.0 * np.pi, 100):
+        assert arm.draw(float(angle))
+        assert (arm.layer.near_raw > 500).all()
+
+
 def test_the_padding_surrounds_the_robot() -> None:
     """50 mm at some 1.4 m are 7 px here."""
     arm = Arm()

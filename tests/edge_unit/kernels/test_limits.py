@@ -14,7 +14,7 @@ from edge_unit.kernels.limits import (
     robot_band_raw,
     static_limit_raw,
 )
-from edge_unit.kernels.rasterize import LANES, NOTHING_FARTHEST
+from edge_unit.kernels.rasterize import LANES, NOTHING_FARTHEST, NOTHING_NEAREST
 
 SHAPE = (37, 61)
 
@@ -118,9 +118,10 @@ def band_twin(
     scale_m: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Lower and upper end in raw units; both RAW_MAX where no robot is."""
-    drawn = nearest_w > 0.0
-    near_m = 1.0 / np.where(drawn, nearest_w, 1.0).astype(np.float64)
-    far_m = np.maximum(1.0 / np.where(drawn, farthest_w, 1.0).astype(np.float64), near_m + depth_m)
+    front, back = nearest_w > NOTHING_NEAREST, farthest_w > NOTHING_FARTHEST
+    drawn = front | back
+    near_m = np.where(front, 1.0 / np.where(front, nearest_w, 1.0).astype(np.float64), 0.0)
+    far_m = np.maximum(np.where(back, 1.0 / np.where(back, -farthest_w, 1.0).astype(np.float64), 0.0), near_m + depth_m)
     low = np.clip((near_m - noise_per_m * near_m**2) / scale_m, 0, RAW_MAX)
     high = np.clip((far_m + noise_per_m * far_m**2) / scale_m, 0, RAW_MAX)
     return np.where(drawn, low, RAW_MAX), np.where(drawn, high, RAW_MAX)
@@ -163,9 +164,12 @@ class Band:
         near_m = rng.uniform(0.05, 8.0, SHAPE)
         inside = between(rectangles)
         drawn = (rng.random(SHAPE) < 0.6) & inside
-        nearest_w = np.where(drawn, 1.0 / near_m, 0.0).astype(np.float32)
+        # Silhouettes and what the near plane cuts have only one of the two.
+        front, back = drawn & (rng.random(SHAPE) < 0.8), drawn & (rng.random(SHAPE) < 0.8)
+        drawn = front | back
+        nearest_w = np.where(front, 1.0 / near_m, NOTHING_NEAREST).astype(np.float32)
         far_m = near_m * rng.choice([1.0, 1.3], SHAPE)
-        farthest_w = np.where(drawn, 1.0 / far_m, NOTHING_FARTHEST).astype(np.float32)
+        farthest_w = np.where(back, -1.0 / far_m, NOTHING_FARTHEST).astype(np.float32)
         window, nearest = windowed(nearest_w, rectangles)
         _, farthest = windowed(farthest_w, rectangles)
         links = np.ones(len(rectangles), np.bool_)

@@ -36,7 +36,9 @@ class Screen:
 
     @property
     def farthest_w(self) -> NDArray[np.float32]:
-        return self.buffer.picture(self.rectangles)[1]
+        """Inverse depth; infinite where nothing was drawn."""
+        w = self.buffer.picture(self.rectangles)[1]
+        return np.where(w > NOTHING_FARTHEST, -w, np.float32(np.inf))
 
     @property
     def drawn(self) -> NDArray[np.bool_]:
@@ -50,8 +52,9 @@ class Screen:
         offsets: list[NDArray[np.float32]] | None = None,
         chosen: list[bool] | None = None,
         over: Screen | None = None,
+        farthest: bool = True,
     ) -> Screen:
-        """Draw all meshes, or the `chosen` over what `over` has drawn of the others."""
+        """Draw all meshes, or the `chosen` over what `over` has drawn of the others, and the `farthest` when wanted."""
         vertices = [mesh.vertices for mesh in meshes]
         offsets = offsets or [np.zeros_like(points) for points in vertices]
         nothing = np.zeros((0, 3), np.float32)
@@ -82,9 +85,11 @@ class Screen:
             np.empty((3, 3), np.float32),
             np.empty((4, 3), np.float64),
             kept.window,
-            *kept.memory,
+            kept.memory[0],
+            kept.memory[1] if farthest else nothing[:, 0],
             self.buffer.window,
-            *self.buffer.memory,
+            self.buffer.memory[0],
+            self.buffer.memory[1] if farthest else nothing[:, 0],
             self.rectangles,
         )
         self.buffer.check()
@@ -151,14 +156,13 @@ class Twin:
             for part in clipped(face):
                 self._draw(part, mesh.closed)
 
-    def _draw(self, part: NDArray[np.float64], cull: bool) -> None:
+    def _draw(self, part: NDArray[np.float64], closed: bool) -> None:
         s = self.screen
         w = 1.0 / part[:, 2]
         p = part[:, :2] * w[:, None] * s.f_px + (s.cx, s.cy)
         area = (p[1, 0] - p[0, 0]) * (p[2, 1] - p[0, 1]) - (p[2, 0] - p[0, 0]) * (p[1, 1] - p[0, 1])
         sliver = abs(area) < DOUBT_PX * np.ptp(p, axis=0).sum()
-        if cull and area > 0.0 and not sliver:
-            return
+        near, far = not (closed and area > 0.0), not (closed and area < 0.0)
         y, x = np.mgrid[0 : s.height, 0 : s.width]
         inside = np.full(x.shape, np.inf)
         for i in range(3):
@@ -178,19 +182,21 @@ class Twin:
             value = np.clip(w[0] + (x - p[0, 0]) * per_u + (y - p[0, 1]) * per_v, w.min(), w.max())
             slack = DOUBT_PX * (abs(per_u) + abs(per_v)) + 2e-6 * w.max()
             least, most = value - slack, value + slack
-        self.nearest_least = np.where(must, np.maximum(self.nearest_least, least), self.nearest_least)
-        self.nearest_most = np.where(may, np.maximum(self.nearest_most, most), self.nearest_most)
-        self.farthest_least = np.where(may, np.minimum(self.farthest_least, least), self.farthest_least)
-        self.farthest_most = np.where(must, np.minimum(self.farthest_most, most), self.farthest_most)
+        if near:
+            self.nearest_least = np.where(must, np.maximum(self.nearest_least, least), self.nearest_least)
+        if near or sliver:
+            self.nearest_most = np.where(may, np.maximum(self.nearest_most, most), self.nearest_most)
+        if far:
+            self.farthest_most = np.where(must, np.minimum(self.farthest_most, most), self.farthest_most)
+        if far or sliver:
+            self.farthest_least = np.where(may, np.minimum(self.farthest_least, least), self.farthest_least)
 
     def check(self) -> None:
         s = self.screen
         assert (s.nearest_w >= self.nearest_least).all()
         assert (s.nearest_w <= self.nearest_most).all()
-        farthest = np.where(s.farthest_w == NOTHING_FARTHEST, np.inf, s.farthest_w)
-        assert (farthest >= self.farthest_least).all()
-        assert (farthest <= self.farthest_most).all()
-        assert (s.drawn == (s.farthest_w < NOTHING_FARTHEST)).all()
+        assert (s.farthest_w >= self.farthest_least).all()
+        assert (s.farthest_w <= self.farthest_most).all()
 
 
 def soup(rng: np.random.Generator, count: int, low: float = -0.2, high: float = 2.0) -> TriangleMesh:
@@ -328,7 +334,24 @@ def test_nearest_and_farthest_of_two_surfaces() -> None:
     screen = Screen().draw([box, box], [from_xyz_rpy((0, 0, z), (0, 0, 0)) for z in (1.0, 2.0)])
     middle = (screen.height // 2, screen.width // 2)
     assert screen.nearest_w[middle] == pytest.approx(1 / 0.9)
-    assert screen.farthest_w[middle] == pytest.approx(1 / 1.9)
+    assert screen.farthest_w[middle] == pytest.approx(1 / 2.1)
+
+
+def test_without_the_farthest_the_nearest_is_the_same() -> None:
+    """Closed and open, whole and cut by the near plane."""
+    ball = sphere_mesh("ball", 0.2)
+    meshes = [ball, TriangleMesh("open", ball.vertices, ball.faces, closed=False)] * 2
+    poses = [from_xyz_rpy(xyz, (0, 0, 0)) for xyz in ((-0.3, 0, 1), (0.3, 0, 1), (0, 0.3, 0.2), (0, -0.3, 0.2))]
+    both, nearest = Screen().draw(meshes, poses), Screen().draw(meshes, poses, farthest=False)
+    assert both.drawn.any()
+    assert (nearest.nearest_w == both.nearest_w).all()
+    assert np.isnan(nearest.buffer.memory[1]).all()
+
+
+def test_from_within_a_solid_only_its_back_is_seen() -> None:
+    screen = Screen().draw([box_mesh("box", (3.0, 3.0, 1.0))], [np.eye(4)])
+    assert not screen.drawn.any()
+    assert np.allclose(screen.farthest_w, 1 / 0.5)
 
 
 @pytest.mark.parametrize("closed", [True, False])
@@ -340,6 +363,8 @@ def test_a_sphere_has_no_holes(seed: int, closed: bool) -> None:
     assert len(ball.faces) > 1000
     ball = TriangleMesh("ball", ball.vertices, ball.faces, closed)
     screen = Screen(301, 203, 210.0).draw([ball], [random_pose(rng, rng.uniform(0.6, 3.0))])
+    assert (np.isfinite(screen.farthest_w) == screen.drawn).all()
+    assert (screen.farthest_w <= np.where(screen.drawn, screen.nearest_w, np.inf)).all()
     for drawn in (screen.drawn, screen.drawn.T):
         steps = np.diff(np.pad(drawn, ((0, 0), (1, 1))).astype(np.int8), axis=1)
         assert ((steps == 1).sum(axis=1) <= 1).all()

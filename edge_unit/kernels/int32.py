@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Integers of 32 bits that stay so: numba widens them to 64, and half as many then fit the vector unit's registers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import numpy as np
+from numba import types
+from numba.extending import intrinsic
+
+
+def _add(_: Any, a: Any, b: Any) -> tuple[Any, Callable[..., Any]]:
+    def emit(_target: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        return builder.add(*values)
+
+    return types.int32(types.int32, types.int32), emit
+
+
+def _multiply(_: Any, a: Any, b: Any) -> tuple[Any, Callable[..., Any]]:
+    def emit(_target: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        return builder.mul(*values)
+
+    return types.int32(types.int32, types.int32), emit
+
+
+def _none_negative(_: Any, a: Any, b: Any, c: Any) -> tuple[Any, Callable[..., Any]]:
+    def emit(_target: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        signs = builder.or_(builder.or_(values[0], values[1]), values[2])
+        return builder.icmp_signed(">=", signs, signs.type(0))
+
+    return types.boolean(types.int32, types.int32, types.int32), emit
+
+
+add = cast(Callable[[np.int32, np.int32], np.int32], intrinsic(_add))
+"""The sum of two, modulo 2**32; for kernels."""
+
+multiply = cast(Callable[[np.int32, np.int32], np.int32], intrinsic(_multiply))
+"""The product of two, modulo 2**32; for kernels."""
+
+none_negative = cast(Callable[[np.int32, np.int32, np.int32], np.bool_], intrinsic(_none_negative))
+"""Whether none of three is negative; for kernels."""

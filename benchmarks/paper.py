@@ -32,8 +32,7 @@ from benchmarks.paper_book import (
     in_mm,
 )
 from benchmarks.paper_scene import Views, views, write_cell
-from benchmarks.pipeline import machine
-from benchmarks.report import RESULTS, Mark, Result, line, write
+from benchmarks.report import RESULTS, Curves, Result, line, write
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError
 from simulation.fleet import MASTER_PREFIX
@@ -124,6 +123,7 @@ def results_of(book: Book, same: Book, parts: Sequence[paper_composed.Parts]) ->
         ),
     )
     return {
+        "contenders": Result("What is compared", ("contender", "what it does"), tuple(CONTENDERS.items())),
         "table_2_distributed": tables.by_size(book, UNITS_COMPOSED),
         "table_1_centralised_same_filter": tables.by_size(book, ONE_PROCESS),
         "table_1_centralised_octree": tables.by_size(book, ONE_OCTREE),
@@ -137,10 +137,31 @@ def results_of(book: Book, same: Book, parts: Sequence[paper_composed.Parts]) ->
     }
 
 
+def curves_of(book: Book) -> dict[str, Curves]:
+    """The pictures, by name: the largest resolution, and every contender that was measured there."""
+    contenders, resolution = (UNITS_COMPOSED, ONE_PROCESS, ONE_OCTREE), [key.resolution for key in book][-1]
+    cameras = tables.PAPER_CAMERAS
+    return {
+        "by_cameras": Curves(
+            f"Refresh of the scene by the number of cameras, {resolution}, {in_mm(VOXEL_M)} mm voxels",
+            "cameras",
+            "refresh, ms",
+            {name: tables.over_cameras(book, name, resolution, in_mm(VOXEL_M)) for name in contenders},
+            "y",
+        ),
+        "by_voxel_size": Curves(
+            f"Refresh of the scene by {cameras} cameras, {resolution}",
+            "voxel, mm",
+            "refresh, ms",
+            {name: tables.over_sizes(book, name, resolution, cameras) for name in contenders},
+            "y",
+        ),
+    }
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print the tables, and all of it as one line of JSON. Exit code 1 when a mark is missed."""
     options = _parser().parse_args(arguments)
-    before, began_ns = os.getloadavg()[0], monotonic_ns()
     try:
         found = asyncio.run(measure(QUICK if options.quick else Amount()))
     except (CellwatchError, ImportError) as error:
@@ -149,19 +170,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     results = results_of(*found)
     print("\n".join(f"\n{result}" for result in results.values()))
     book, same, _ = found
-    marks: list[Mark] = [mark for result in results.values() for mark in result.marks]
-    rows = [*book.rows(), *(row for row in same.rows() if row["contender"] == UNITS_SAME_FRAMES)]
     document: dict[str, Any] = {
-        "title": "The paper's experiment: the scene's refresh, distributed and centralised",
-        "contenders": CONTENDERS,
-        "paper": tables.STATED,
         **{name: result.document() for name, result in results.items()},
-        "measurements": rows,
-        "marks": [mark.document() for mark in marks],
-        "passed": all(mark.met for mark in marks),
-        "machine": machine() | {"cores": len(os.sched_getaffinity(0))},
-        "load_average_before": before,
-        "seconds": round((monotonic_ns() - began_ns) / NS_PER_S, 1),
+        **{name: curves.document() for name, curves in curves_of(book).items()},
+        "stated_by_the_paper": tables.STATED,
+        "measurements": [*book.rows(), *(row for row in same.rows() if row["contender"] == UNITS_SAME_FRAMES)],
+        "passed": all(mark.met for result in results.values() for mark in result.marks),
         "quick": options.quick,
     }
     if options.results or not options.quick:

@@ -230,6 +230,17 @@ def running(book: Book) -> Result:
     return Result(f"Refresh of the scene: {UNITS_RUNNING}", columns, tuple(rows), remarks=(remark,))
 
 
+def over_cameras(book: Book, contender: str, resolution: str, voxel_mm: int) -> list[tuple[float, float]]:
+    """Refresh in milliseconds over the number of cameras."""
+    return [(count, book.median(contender, resolution, voxel_mm, count)) for count in range(1, CAMERAS + 1)]
+
+
+def over_sizes(book: Book, contender: str, resolution: str, cameras: int) -> list[tuple[float, float]]:
+    """Refresh in milliseconds over the voxel size in millimetres."""
+    sizes = sorted({key.voxel_mm for key in book if (key.contender, key.resolution) == (contender, resolution)})
+    return [(size, book.median(contender, resolution, size, cameras)) for size in sizes]
+
+
 def marks(book: Book, same: Book, resolution: str, voxel_mm: int) -> tuple[Mark, ...]:
     """What the distributed way is held against."""
     one, four = (same.median(UNITS_SAME_FRAMES, resolution, voxel_mm, count) for count in (1, CAMERAS))

@@ -47,6 +47,13 @@ PARTS = (
         limit_s=400.0,
     ),
     Part(
+        "paper",
+        "bench-paper",
+        "The paper's experiment",
+        "How long until the map holds what one to four cameras see: with a unit at each, or in one computer?",
+        limit_s=480.0,
+    ),
+    Part(
         "real",
         "real",
         "Real frames of a real robot",

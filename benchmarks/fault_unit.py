@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ class PictureSource(RecordedSource):
         super().__init__(config)
         self._image = config.folder / IMAGE
 
-    async def frames(self) -> AsyncIterator[DepthFrame]:
+    async def frames(self) -> AsyncGenerator[DepthFrame, None]:
         """See `DepthSource`."""
         period_ns = round(NS_PER_S / FPS)
         number, due_ns = 0, monotonic_ns()

@@ -74,7 +74,7 @@ class BoardSearch:
                     board, info.intrinsics, info.distortion, info.T_depth_image, info.distortion_model
                 )
                 seen, empty = 0, 0
-                async with aclosing(look.images()) as images:  # type: ignore[type-var]
+                async with aclosing(look.images()) as images:
                     async for image in images:
                         sighting = await asyncio.to_thread(localiser.add, image.pixels.copy())
                         tell(f"looking for the board: {localiser.now}")

@@ -9,10 +9,9 @@ made with, so that nothing is ever merged under another lattice, cell or pose th
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import importlib.metadata
 import logging
-from collections.abc import AsyncGenerator
+from contextlib import aclosing, suppress
 
 from edge_unit.assigned_pipeline import AssignedPipeline
 from edge_unit.background import BackgroundStore
@@ -162,14 +161,10 @@ class Unit:
         while True:
             try:
                 await self._open()
-                frames = self._source.frames()
-                try:
+                async with aclosing(self._source.frames()) as frames:
                     async for frame in frames:
                         retry_s = REOPEN_MIN_S
                         await self._take(frame)
-                finally:
-                    if isinstance(frames, AsyncGenerator):
-                        await frames.aclose()
                 await self._end()
                 return
             except SourceError as error:
@@ -194,7 +189,7 @@ class Unit:
         if assignment is not None and assignment.T_world_camera is not None:
             # Before the camera delivers, so that no frame has to wait for what is compiled and drawn only once.
             # What cannot be prepared is told with each frame, for the master may change it.
-            with contextlib.suppress(InputError), self._progress.working("preparing for frames", PREPARE_S_MAX):
+            with suppress(InputError), self._progress.working("preparing for frames", PREPARE_S_MAX):
                 await asyncio.to_thread(self._assigned.prepare, assignment, assignment.T_world_camera)
 
     def _rehearse(self) -> None:

@@ -158,6 +158,7 @@ class GuardedHttp(HttpToolsProtocol):
     _in_head = True
     _head_bytes = 0
 
+    # The base narrows the type as well.
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         self.begun = True
         super().connection_made(transport)

@@ -100,9 +100,8 @@ class StateFile:
 
 def _write(path: Path, content: bytes, mode: int, owner: tuple[int, int] | None, synced: bool) -> None:
     partial = path.with_suffix(".partial")
-    partial.unlink(missing_ok=True)
     try:
-        with os.fdopen(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+        with os.fdopen(_new(partial, mode), "wb") as file:
             if owner is not None:
                 os.fchown(file.fileno(), *owner)
             file.write(content)
@@ -115,3 +114,12 @@ def _write(path: Path, content: bytes, mode: int, owner: tuple[int, int] | None,
         raise
     if synced:
         sync_folder(path.parent)
+
+
+def _new(path: Path, mode: int) -> int:
+    """Open a file that nobody else has open; what was left of a write that was cut short is taken away."""
+    try:
+        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    except FileExistsError:
+        path.unlink()
+        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)

@@ -383,5 +383,5 @@ def matrix_of(transform: Transform) -> Matrix:
     """
     if transform.shape != (4, 4):
         raise InputError(f"transform: expected shape (4, 4), got {transform.shape}")
-    a, b, c, d = (tuple(float(value) for value in row) for row in transform)
-    return a, b, c, d  # type: ignore[return-value]
+    a, b, c, d = ((float(x), float(y), float(z), float(w)) for x, y, z, w in transform)
+    return a, b, c, d

@@ -14,6 +14,8 @@ import pytest
 from blockbuster import BlockBuster
 from hypothesis import settings
 
+from tests.missing import missing
+
 CHECKOUT = Path(__file__).resolve().parent.parent
 SLOW_TIMEOUT_S = 600
 # What was told to stop may need a moment; what nobody told to stop outlives any moment.
@@ -43,10 +45,7 @@ def data_dir() -> Iterator[Path]:
     """
     folder = Path(os.environ.get("CELLWATCH_DATA") or CHECKOUT.parent / "shared" / "data").resolve()
     if not folder.is_dir():
-        reason = f"no recorded data: {folder} is not a folder (CELLWATCH_DATA names another)"
-        if os.environ.get("CI"):
-            pytest.fail(reason, pytrace=False)
-        pytest.skip(reason)
+        missing(f"no recorded data: {folder} is not a folder (CELLWATCH_DATA names another)")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CELLWATCH_DATA", str(folder))
         yield folder

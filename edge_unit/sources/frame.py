@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -51,7 +51,7 @@ class DepthSource(Protocol):
         """
         ...
 
-    def frames(self) -> AsyncIterator[DepthFrame]:
+    def frames(self) -> AsyncGenerator[DepthFrame, None]:
         """Frames as they come, latest wins: a slow reader skips, it never lags. Ends where a recording ends.
 
         Raises:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
@@ -53,7 +53,7 @@ class ImageLook(Protocol):
         """The stream's lens, and where it stands."""
         ...
 
-    def images(self) -> AsyncIterator[ImageFrame]:
+    def images(self) -> AsyncGenerator[ImageFrame, None]:
         """Pictures as they come, latest wins.
 
         Raises:

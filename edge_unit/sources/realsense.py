@@ -8,7 +8,7 @@ unplugged, stalls or takes its process along is waited for and begun anew, while
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Literal, cast
@@ -94,7 +94,7 @@ class Look:
         self.info = info
         self._supervisor = supervisor
 
-    async def images(self) -> AsyncIterator[ImageFrame]:
+    async def images(self) -> AsyncGenerator[ImageFrame, None]:
         """Pictures as they come, latest wins; ends where a recording ends.
 
         Raises:
@@ -133,7 +133,7 @@ class RealsenseSource:
             await self.close()
             raise
 
-    async def frames(self) -> AsyncIterator[DepthFrame]:
+    async def frames(self) -> AsyncGenerator[DepthFrame, None]:
         """Frames as they come, latest wins; `depth` lies in shared memory and is valid until the next frame is taken.
 
         While the camera is away this waits. It ends where a recording ends.

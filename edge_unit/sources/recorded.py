@@ -13,7 +13,7 @@ import io
 import os
 import re
 import zipfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -112,7 +112,7 @@ class RecordedSource:
         self._recording = await asyncio.to_thread(_open, self._config)
         return self._recording.info
 
-    async def frames(self) -> AsyncIterator[DepthFrame]:
+    async def frames(self) -> AsyncGenerator[DepthFrame, None]:
         """The frames in order, at the configured rate; ends at the end unless it loops.
 
         Raises:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -86,7 +86,7 @@ class SimulatedLook:
             self._camera.stream, self._camera.intrinsics, (0.0,) * 5, "brown_conrady", self._camera.T_depth_image
         )
 
-    async def images(self) -> AsyncIterator[ImageFrame]:
+    async def images(self) -> AsyncGenerator[ImageFrame, None]:
         """See `ImageLook`; taken as fast as they are wanted."""
         loop = asyncio.get_running_loop()
         for number in itertools.count():
@@ -131,7 +131,7 @@ class SimulatedSource:
             await self.close()
             raise
 
-    async def frames(self) -> AsyncIterator[DepthFrame]:
+    async def frames(self) -> AsyncGenerator[DepthFrame, None]:
         """See `DepthSource`. A frame is captured at the moment at which it is due, and rendered right after."""
         worker = self._worker
         if worker is None:

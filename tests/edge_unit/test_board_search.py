@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
 
 import numpy as np
@@ -46,7 +46,7 @@ class Pictures:
         finally:
             self.looking = False
 
-    async def images(self) -> AsyncIterator[ImageFrame]:
+    async def images(self) -> AsyncGenerator[ImageFrame, None]:
         while self.pictures:
             yield ImageFrame(self.pictures[self.taken % len(self.pictures)], monotonic_ns(), self.taken)
             self.taken += 1

@@ -39,8 +39,12 @@ class FakeMaster:
         return self.meshes[sha256]
 
 
+async def ask(cache: CellCache, master: Any) -> Cell:
+    return await cache.get(master.reference, master)
+
+
 async def fetch(folder: Path, master: FakeMaster) -> Cell:
-    return await CellCache(folder).get(master.reference, master)  # type: ignore[arg-type]
+    return await ask(CellCache(folder), master)
 
 
 async def test_a_cell_is_fetched_once(tmp_path: Path) -> None:
@@ -56,8 +60,8 @@ async def test_a_cell_is_fetched_once(tmp_path: Path) -> None:
 async def test_a_cell_that_did_not_change_is_the_same_object(tmp_path: Path) -> None:
     master = FakeMaster(await asyncio.to_thread(cell, "one", 0.1))
     cache = CellCache(tmp_path)
-    first = await cache.get(master.reference, master)  # type: ignore[arg-type]
-    assert await cache.get(master.reference, master) is first  # type: ignore[arg-type]
+    first = await ask(cache, master)
+    assert await ask(cache, master) is first
 
 
 async def test_of_a_changed_cell_only_what_is_new_is_fetched_and_the_old_forgotten(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import SecretStr
 
 from edge_unit.config import ENVIRONMENT_PREFIX, PoseConfig, UnitConfig, default_state_dir
 from edge_unit.sources.recorded import RecordedSourceConfig, read_pose
@@ -71,7 +72,7 @@ def test_what_is_wrong_is_named(tmp_path: Path, line: str, words: str) -> None:
 
 
 def test_the_token_is_never_shown(tmp_path: Path) -> None:
-    config = UnitConfig(source=SimulatedSourceConfig(), token="secret-0123456789")  # type: ignore[arg-type]
+    config = UnitConfig(source=SimulatedSourceConfig(), token=SecretStr("secret-0123456789"))
     assert "secret" not in repr(config)
     assert config.read_token() == "secret-0123456789"
 

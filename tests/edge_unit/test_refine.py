@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -158,8 +160,9 @@ def test_what_is_no_image_of_this_camera_is_refused() -> None:
         pipeline.refiner().refine([])
     with pytest.raises(InputError):
         pipeline.refiner().refine([np.zeros((3, 4), np.uint16)])
+    metres: Any = np.zeros(EYE.shape, np.float32)
     with pytest.raises(InputError):
-        Refiner(EYE, OVERHEAD, expected_of_small_cell(), 0.01).refine([np.zeros(EYE.shape, np.float32)])  # type: ignore[list-item]
+        Refiner(EYE, OVERHEAD, expected_of_small_cell(), 0.01).refine([metres])
 
 
 def test_the_median_needs_half_of_the_frames() -> None:

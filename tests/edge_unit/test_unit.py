@@ -6,7 +6,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -89,7 +89,7 @@ class FakeSource:
         self.opened += 1
         return CameraInfo(self.serial, "fake", self.camera)
 
-    async def frames(self) -> AsyncIterator[DepthFrame]:
+    async def frames(self) -> AsyncGenerator[DepthFrame, None]:
         while True:
             item = await self.queue.get()
             if item is None:
@@ -653,7 +653,7 @@ class LookingSource(FakeSource):
         self.looks += 1
         yield self
 
-    async def images(self) -> AsyncIterator[ImageFrame]:
+    async def images(self) -> AsyncGenerator[ImageFrame, None]:
         for number in range(100):
             yield ImageFrame(self.with_board if self.mounted else self.with_board * 0, monotonic_ns(), number)
 

@@ -7,13 +7,14 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from edge_unit import uplink as module
-from edge_unit.client import TIMEOUT
+from edge_unit.cell_cache import CellCache
+from edge_unit.client import TIMEOUT, MasterClient
 from edge_unit.sources.frame import CameraInfo
 from edge_unit.uplink import Delivery, Report, Uplink, seen_report
 from edge_unit.visibility import SeenBlocks
@@ -114,8 +115,8 @@ class Bench:
         self.master = FakeMaster(**fields)
         self.sent: list[tuple[Report, Delivery | None]] = []
         self.uplink = Uplink(
-            self.master,  # type: ignore[arg-type]
-            OneCell(),  # type: ignore[arg-type]
+            cast(MasterClient, self.master),
+            cast(CellCache, OneCell()),
             "software",
             "boot",
             lambda report, delivery: self.sent.append((report, delivery)),
@@ -260,7 +261,8 @@ async def test_what_the_master_changes_is_a_new_assignment() -> None:
         assert second is not None
         assert second.versions == bench.master.versions
         assert second.lattice.voxel_size_m == second.settings.voxel_size_m == 0.1
-        assert np.array_equal(second.T_world_camera, moved)  # type: ignore[arg-type]
+        assert second.T_world_camera is not None
+        assert np.array_equal(second.T_world_camera, moved)
         assert second.cell is first.cell
         assert second.session == first.session
         # And a pose that is void.

@@ -25,7 +25,7 @@ from shared.cell import Cell, PlacedMesh
 from shared.errors import InputError, Refusal
 from shared.kinematics import DHJoint, Robot
 from shared.meshes import box_mesh
-from shared.messages import JointsRequest
+from shared.messages import JointsRequest, matrix_of
 from shared.settings import Settings
 from shared.transforms import from_xyz_rpy
 from shared.wire import MEDIA_TYPE
@@ -61,7 +61,7 @@ def test_after_a_move_nothing_counts_until_units_work_with_it() -> None:
     one = Master(watched(), Settings())
     unit = live(one, 5, 6)
     old = unit.versions
-    answer = one.move_object("crate", tuple(map(tuple, MOVED.tolist())))  # type: ignore[arg-type]
+    answer = one.move_object("crate", matrix_of(MOVED))
     assert answer.cell == one.published.reference
     assert (answer.versions.cell, answer.versions.lattice) == (2, 1)
     view = one.view(NOW_NS)
@@ -125,7 +125,7 @@ def test_a_cell_that_cannot_be_watched_changes_nothing() -> None:
     with pytest.raises(InputError, match="smaller box"):
         one.change_cell(watched((90.0, 90.0, 20.0)))
     with pytest.raises(Refusal, match="object box: not in this cell; its objects are crate"):
-        one.move_object("box", tuple(map(tuple, MOVED.tolist())))  # type: ignore[arg-type]
+        one.move_object("box", matrix_of(MOVED))
     assert one.view(NOW_NS).complete
 
 

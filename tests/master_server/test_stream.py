@@ -226,8 +226,13 @@ async def test_states_are_logged_at_their_time_though_nobody_listens(caplog: pyt
     stream.start()
     told = asyncio.Event()
     monotonic_began_ns = monotonic_ns()
-    handler = logging.Handler()
-    handler.emit = lambda record: told.set() if "stale" in record.getMessage() else None  # type: ignore[method-assign]
+
+    class Ear(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            if "stale" in record.getMessage():
+                told.set()
+
+    handler = Ear()
     logging.getLogger("master_server.registry").addHandler(handler)
     try:
         assert await within(1.0, told.wait())

@@ -209,7 +209,7 @@ def test_nothing_in_a_cell_can_be_changed(demo: Cell) -> None:
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1
     with pytest.raises(dataclasses.FrozenInstanceError):
-        demo.name = "other"  # type: ignore[misc]
+        demo.name = "other"  # type: ignore[misc]  # what must fail
 
 
 def test_lattice_covers_the_box_and_has_a_limit(demo: Cell) -> None:

@@ -6,8 +6,8 @@ from __future__ import annotations
 import asyncio
 import random
 from collections import Counter
-from collections.abc import Awaitable, Callable
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -133,14 +133,10 @@ async def flood(peers: BadPeers, ip: str) -> None:
             writer.transport.abort()
 
 
-class closed:  # noqa: N801
+@contextmanager
+def closed(writer: asyncio.StreamWriter) -> Iterator[None]:
     """Aborts a connection in the end."""
-
-    def __init__(self, writer: asyncio.StreamWriter) -> None:
-        self._writer = writer
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, *_: object) -> None:
-        self._writer.transport.abort()
+    try:
+        yield
+    finally:
+        writer.transport.abort()

@@ -13,10 +13,11 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
+
+from tests.missing import missing
 
 WIDTH, HEIGHT = 1280, 800
 
@@ -36,10 +37,7 @@ def chromium() -> str:
     """Where the browser is; without one a test is skipped, except where CI is set: there it fails."""
     path = shutil.which("chromium") or shutil.which("chromium-browser")
     if path is None:
-        reason = "no browser: expected Debian's chromium (scripts/system-packages installs it)"
-        if os.environ.get("CI"):
-            pytest.fail(reason, pytrace=False)
-        pytest.skip(reason)
+        missing("no browser: expected Debian's chromium (scripts/system-packages installs it)")
     return path
 
 

@@ -27,7 +27,7 @@ STOP_S = 2.0
 
 Found = TypeVar("Found")
 
-CELL = {"name": "bench", "box": {"min": [0.0, 0.0, 0.0], "max": [2.0, 2.0, 2.0]}}
+CELL: dict[str, Any] = {"name": "bench", "box": {"min": [0.0, 0.0, 0.0], "max": [2.0, 2.0, 2.0]}}
 
 WIDTH, HEIGHT, FOCAL_PX = 160, 120, 120.0
 WALL_MM, PATCH_MM = 5000, 1500

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import signal
 import ssl
 import subprocess
@@ -17,8 +16,8 @@ import pytest
 import trustme
 import yaml
 
-from benchmarks.fault_network import NAMESPACES, allowed
 from shared.messages import CONTRACT_VERSION
+from tests.missing import need_namespaces
 from tests.system.cluster import CELL, Cluster, stop, until, write_recording
 from tests.system.lan import Host, Lan
 
@@ -34,11 +33,7 @@ MOVED_S = 8.0
 
 @pytest.fixture(scope="module", autouse=True)
 def namespaces() -> None:
-    if not any(allowed(unshare) for unshare in NAMESPACES):
-        reason = "the kernel allows no namespaces here"
-        if os.environ.get("CI"):
-            pytest.fail(reason, pytrace=False)
-        pytest.skip(reason)
+    need_namespaces()
 
 
 class Site(Cluster):

@@ -4,23 +4,17 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-import master_server.__main__
-from benchmarks.fault_network import NAMESPACES, allowed
 from benchmarks.fault_watch import NOTICED_S_MAX, RECOVERED_S_MAX
 from benchmarks.faults import FAULTS
+from tests.missing import need_namespaces
 
 pytestmark = pytest.mark.slow
-
-TOKENS_ARE_READ_ANEW = "new-token" in Path(master_server.__main__.__file__).read_text()
-"""Else a master knows the tokens that it began with, until it is started again."""
 
 BUSY_S = 1.0
 """What other tests beside may add to a time; what is said of the map holds however busy the machine is."""
@@ -28,11 +22,7 @@ BUSY_S = 1.0
 
 @pytest.fixture(scope="module", autouse=True)
 def namespaces() -> None:
-    if not any(allowed(unshare) for unshare in NAMESPACES):
-        reason = "the kernel allows no namespaces here"
-        if os.environ.get("CI"):
-            pytest.fail(reason, pytrace=False)
-        pytest.skip(reason)
+    need_namespaces()
 
 
 def struck(name: str) -> dict[str, Any]:
@@ -46,8 +36,6 @@ def struck(name: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
 def test_nothing_is_called_free_that_nobody_sees(fault: Any) -> None:
-    if fault.name == "token-revoked" and not TOKENS_ARE_READ_ANEW:
-        pytest.skip("this master reads its tokens once")
     row = struck(fault.name)
     assert not row["false_free"], row
     assert row["lost"] == 0, row

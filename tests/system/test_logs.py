@@ -10,6 +10,7 @@ import httpx
 import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from tests.system.cluster import Cluster, write_cell
 
@@ -31,7 +32,8 @@ def test_no_line_holds_a_token(tmp_path: Path, level: str) -> None:
             with pytest.raises(InvalidStatus):
                 connect(f"{url}?token={token}", proxy=None)
             if token != REFUSED:
-                with connect(url, subprotocols=["cellwatch", f"bearer.{token}"], proxy=None) as reader:  # type: ignore[list-item]
+                offered = [Subprotocol("cellwatch"), Subprotocol(f"bearer.{token}")]
+                with connect(url, subprotocols=offered, proxy=None) as reader:
                     reader.recv()
         log = cluster.log("master")
     for token in (operator, unit, REFUSED):

@@ -4,15 +4,14 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from typing import Any
 
 import pytest
 
-from benchmarks.fault_network import NAMESPACES, allowed
 from benchmarks.plug_and_play import FIRST_VOXEL_S_MAX, NOTICE_S_MAX, POSE_DEG_MAX, POSE_MM_MAX, ROBOT_PERCENT_MAX
+from tests.missing import need_namespaces
 
 pytestmark = pytest.mark.slow
 
@@ -25,11 +24,7 @@ BUSY_START = 5.0
 
 @pytest.fixture(scope="module")
 def played() -> dict[str, Any]:
-    if not any(allowed(unshare) for unshare in NAMESPACES):
-        reason = "the kernel allows no namespaces here"
-        if os.environ.get("CI"):
-            pytest.fail(reason, pytrace=False)
-        pytest.skip(reason)
+    need_namespaces()
     command = (sys.executable, "-m", "benchmarks.plug_and_play", "--quiet-seconds", "6")
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.stdout, run.stderr

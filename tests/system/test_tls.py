@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import ClassVar
 
 import httpx
 import pytest
@@ -101,8 +102,10 @@ def test_older_tls_and_none_get_no_answer(cluster: Cluster) -> None:
 class Rogue(http.server.BaseHTTPRequestHandler):
     """Stands where the master stood, with a certificate of its own."""
 
+    requests: ClassVar[list[str]] = []
+
     def do_POST(self) -> None:
-        self.server.requests.append(self.requestline)  # type: ignore[attr-defined]
+        self.requests.append(self.requestline)
         self.send_error(404)
 
     def log_message(self, *_: object) -> None:
@@ -119,7 +122,7 @@ def test_a_unit_tells_a_rogue_master_nothing_and_returns_to_its_own(cluster: Clu
     master.terminate()
     master.wait()
     rogue = http.server.ThreadingHTTPServer(("127.0.0.1", cluster.port), Rogue)
-    rogue.requests = []  # type: ignore[attr-defined]
+    Rogue.requests.clear()
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     trustme.CA().issue_cert("127.0.0.1").configure_cert(context)
     rogue.socket = context.wrap_socket(rogue.socket, server_side=True)
@@ -131,7 +134,7 @@ def test_a_unit_tells_a_rogue_master_nothing_and_returns_to_its_own(cluster: Clu
         rogue.shutdown()
         rogue.server_close()
         thread.join()
-    assert rogue.requests == []  # type: ignore[attr-defined]
+    assert Rogue.requests == []
     assert unit.poll() is None
     files = (
         "--tls-certificate", str(cluster.folder / "certificate.pem"), "--tls-key", str(cluster.folder / "key.pem"),

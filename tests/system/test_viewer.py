@@ -25,6 +25,7 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
 
 from master_server.viewer.scene import STATE_COLOURS, VIEW_FOV_RAD, view_edges, view_of
 from shared.camera import Intrinsics
@@ -47,7 +48,7 @@ SEEN_S = 40.0
 GONE_S = 5.0
 """For what was told to end."""
 
-VISER = "viser-v1.1.1"
+VISER = Subprotocol("viser-v1.1.1")
 
 
 class TerminalCluster(Cluster):
@@ -117,7 +118,7 @@ def page(cluster: TerminalCluster, browser: Browser, witness: Witness) -> Iterat
 
 def on_screen(page: Page, points_m: NDArray[np.float64]) -> NDArray[np.int64]:
     """Pixels (N, 2) x, y of world points (N, 3), as one who has just come sees them."""
-    eye, target = view_of(*(np.array(CELL["box"][corner]) for corner in ("min", "max")))  # type: ignore[index]
+    eye, target = view_of(*(np.array(CELL["box"][corner]) for corner in ("min", "max")))
     rect = page.evaluate("() => document.querySelector('canvas').getBoundingClientRect().toJSON()")
     seen = apply(inverse(look_at(eye, target)), points_m)
     focal_px = rect["height"] / 2.0 / np.tan(VIEW_FOV_RAD / 2.0)
@@ -378,7 +379,7 @@ def headers(cluster: Cluster) -> dict[str, str]:
 
 def socket(cluster: Cluster, **more: Any) -> ClientConnection:
     url = f"{cluster.url.replace('http', 'ws', 1)}/viewer/"
-    return connect(url, subprotocols=[VISER], max_size=None, proxy=None, **more)  # type: ignore[list-item]
+    return connect(url, subprotocols=[VISER], max_size=None, proxy=None, **more)
 
 
 def test_no_tunnel_is_opened_to_anywhere(cluster: TerminalCluster) -> None:
@@ -436,7 +437,7 @@ def test_its_own_port_tells_nobody_anything(cluster: TerminalCluster) -> None:
         talker.recv(timeout=SEEN_S)
         (port,) = {found.laddr.port for found in viewer_process(cluster).net_connections() if found.status == "LISTEN"}
         with (
-            connect(f"ws://127.0.0.1:{port}/", subprotocols=[VISER], proxy=None) as direct,  # type: ignore[list-item]
+            connect(f"ws://127.0.0.1:{port}/", subprotocols=[VISER], proxy=None) as direct,
             pytest.raises(ConnectionClosedError, match="1008"),
         ):
             direct.recv(timeout=SEEN_S)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -40,9 +42,9 @@ def static_twin(
     return np.clip(limit_m / scale_m, 0.0, RAW_MAX)
 
 
-def static_limit(*arguments: object) -> NDArray[np.uint16]:
+def static_limit(*arguments: Any) -> NDArray[np.uint16]:
     out = np.full(np.shape(arguments[0]), 123, np.uint16)
-    static_limit_raw(*arguments, out)  # type: ignore[arg-type]
+    static_limit_raw(*arguments, out)
     return out
 
 

@@ -211,7 +211,7 @@ async def test_a_hung_capture_process_is_told_within_a_second_and_replaced(recor
         frames = source.frames()
         numbers = [(await anext(frames)).frame_number for _ in range(5)]
         assert numbers == sorted(set(numbers))
-        await frames.aclose()  # type: ignore[attr-defined]  # an async generator
+        await frames.aclose()
 
 
 async def test_closing_a_hung_capture_process_takes_no_longer_than_it_should(recording: Path) -> None:
@@ -235,7 +235,7 @@ async def test_a_frame_stays_as_it_was_while_its_process_dies(recording: Path) -
         await until(source, lambda status: status.state == "restarting")
         await until(source, lambda status: status.state == "live")
         check(frame)
-        await frames.aclose()  # type: ignore[attr-defined]  # an async generator
+        await frames.aclose()
     check(frame)
 
 
@@ -245,7 +245,7 @@ async def test_it_may_be_opened_again(recording: Path) -> None:
         await source.open()
         frames = source.frames()
         check(await anext(frames))
-        await frames.aclose()  # type: ignore[attr-defined]  # an async generator
+        await frames.aclose()
         await source.close()
     await source.close()
 
@@ -268,7 +268,7 @@ async def test_a_camera_may_be_unplugged_and_plugged_in_again(recording: Path, t
     source = RealsenseSource(RealsenseSourceConfig(serial="SYN0001"), command(sockets))
     opening = asyncio.create_task(source.open())
     await until(source, lambda status: status.state == "absent")
-    plug(sockets, [recording])
+    await asyncio.to_thread(plug, sockets, [recording])
     assert (await opening).serial == "SYN0001"
     numbers = []
 
@@ -279,14 +279,14 @@ async def test_a_camera_may_be_unplugged_and_plugged_in_again(recording: Path, t
     reading = asyncio.create_task(read())
     await until(source, lambda status: status.state == "live")
     for _ in range(2):
-        plug(sockets, [])
+        await asyncio.to_thread(plug, sockets, [])
         unplugged_ns = monotonic_ns()
         status = await until(source, lambda status: status.state != "live")
         assert status.reason == "camera SYN0001 was unplugged"
         assert status.since_ns - unplugged_ns < NS_PER_S // 2
         status = await until(source, lambda status: status.state == "absent")
         assert status.reason == "no RealSense camera SYN0001 is connected (there is none)"
-        plug(sockets, [recording])
+        await asyncio.to_thread(plug, sockets, [recording])
         await until(source, lambda status: status.state == "live")
     await asyncio.sleep(0.2)
     await source.close()
@@ -297,10 +297,10 @@ async def test_a_camera_may_be_unplugged_and_plugged_in_again(recording: Path, t
 
 async def test_another_camera_is_never_taken_for_the_first(recording: Path, other: Path, tmp_path: Path) -> None:
     sockets = tmp_path / "sockets"
-    plug(sockets, [recording])
+    await asyncio.to_thread(plug, sockets, [recording])
     source = RealsenseSource(RealsenseSourceConfig(), command(sockets))
     assert (await source.open()).serial == "SYN0001"
-    plug(sockets, [other])
+    await asyncio.to_thread(plug, sockets, [other])
     with pytest.raises(SourceError, match=r"the camera was SYN0001 \(424x240\) and is SYN0002 \(424x240\) now"):
         async for _ in source.frames():
             pass
@@ -311,7 +311,7 @@ async def test_another_camera_is_never_taken_for_the_first(recording: Path, othe
 
 async def test_of_two_cameras_one_must_be_chosen(recording: Path, other: Path, tmp_path: Path) -> None:
     sockets = tmp_path / "sockets"
-    plug(sockets, [recording, other])
+    await asyncio.to_thread(plug, sockets, [recording, other])
     source = RealsenseSource(RealsenseSourceConfig(open_timeout_s=1.0), command(sockets))
     with pytest.raises(SourceError, match=r"2 RealSense cameras are connected \(SYN0001, SYN0002\); choose one"):
         await source.open()

@@ -37,7 +37,7 @@ def cell() -> Cell:
 async def take(source: DepthSource, count: int, pause_s: float = 0.0) -> list[DepthFrame]:
     """The next frames, read by somebody who needs `pause_s` for each."""
     found: list[DepthFrame] = []
-    async with aclosing(source.frames()) as frames:  # type: ignore[type-var]
+    async with aclosing(source.frames()) as frames:
         async for frame in frames:
             found.append(frame)
             if len(found) == count:
@@ -79,7 +79,7 @@ async def test_a_slow_reader_skips_and_never_lags() -> None:
         await asyncio.wait_for(source.open(), WAIT_S)
         ages_ns = []
         numbers = []
-        async with aclosing(source.frames()) as frames:  # type: ignore[type-var]
+        async with aclosing(source.frames()) as frames:
             async for frame in frames:
                 ages_ns.append(monotonic_ns() - frame.captured_at_ns)
                 numbers.append(frame.frame_number)
@@ -169,15 +169,15 @@ async def test_a_camera_that_is_knocked_covered_and_exchanged(cell: Cell, tmp_pa
         info = await asyncio.wait_for(source.open(), WAIT_S)
         assert info.T_world_camera is not None
         before = (await asyncio.wait_for(take(source, 1), WAIT_S))[0]
-        knock.write(handling)
+        await asyncio.to_thread(knock.write, handling)
         knocked = (await asyncio.wait_for(take(source, 1), WAIT_S))[0]
-        Handling(covered=True).write(handling)
+        await asyncio.to_thread(Handling(covered=True).write, handling)
         covered = (await asyncio.wait_for(take(source, 1), WAIT_S))[0]
         async with source.look("infrared") as look, aclosing(look.images()) as images:
             assert not (await anext(images)).pixels.any()
-        LEFT_ALONE.write(handling)
+        await asyncio.to_thread(LEFT_ALONE.write, handling)
         back = (await asyncio.wait_for(take(source, 1), WAIT_S))[0]
-        Handling(serial="ANOTHER").write(handling)
+        await asyncio.to_thread(Handling(serial="ANOTHER").write, handling)
         with pytest.raises(SourceError, match="SIM0000001 was unplugged"):
             await asyncio.wait_for(take(source, 1), WAIT_S)
         await source.close()

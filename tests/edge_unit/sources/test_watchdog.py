@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import pytest
 
+from edge_unit.sources.capture_link import PhaseName
 from edge_unit.sources.watchdog import BACK_OFF_S, PATIENCE_S, STEADY_NS, Watchdog
 from shared.clock import NS_PER_MS, NS_PER_S
 
@@ -20,10 +21,10 @@ def streaming(fps: int = 15) -> Watchdog:
 
 
 @pytest.mark.parametrize("phase", PATIENCE_S)
-def test_each_phase_has_its_own_patience(phase: str) -> None:
+def test_each_phase_has_its_own_patience(phase: PhaseName) -> None:
     watchdog = Watchdog()
     watchdog.begin(START_NS)
-    watchdog.hear(START_NS, phase)  # type: ignore[arg-type]  # a key of the table
+    watchdog.hear(START_NS, phase)
     patience_ns = round(PATIENCE_S[watchdog.phase] * NS_PER_S)
     assert watchdog.stuck_s(START_NS + patience_ns) is None
     assert watchdog.stuck_s(START_NS + patience_ns + NS_PER_MS) == pytest.approx(PATIENCE_S[watchdog.phase], abs=0.002)

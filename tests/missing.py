@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a test needs and this machine has not."""
+
+from __future__ import annotations
+
+import os
+from typing import NoReturn
+
+import pytest
+
+from benchmarks.fault_network import NAMESPACES, allowed
+
+
+def missing(reason: str) -> NoReturn:
+    """Skip the test, except where CI is set: there it fails."""
+    if os.environ.get("CI"):
+        pytest.fail(reason, pytrace=False)
+    pytest.skip(reason)
+
+
+def need_namespaces() -> None:
+    """Networks of its own, in which a test may do what it likes."""
+    if not any(allowed(unshare) for unshare in NAMESPACES):
+        missing("the kernel allows no namespaces here")

@@ -96,7 +96,7 @@ def apply(transform: Transform, points_m: NDArray[Any]) -> NDArray[np.float64]:
 def look_at(eye_m: ArrayLike, target_m: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Transform:
     """`T_world_camera` of an optical frame at `eye_m` whose z axis points at `target_m`.
 
-    `up` is the world direction that is up in the picture; looking along it, world y takes its place.
+    `up` is the world direction that is up in the picture; looking along it, world y takes its place, and z that of y.
 
     Raises:
         InputError: eye and target are the same point.
@@ -107,9 +107,10 @@ def look_at(eye_m: ArrayLike, target_m: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.
     if distance == 0.0:
         raise InputError("look_at: expected a target away from the eye, got the same point")
     forward = forward / distance
-    right = np.cross(forward, np.asarray(up, dtype=np.float64))
-    if np.linalg.norm(right) < 1e-6:
-        right = np.cross(forward, (0.0, 1.0, 0.0))
+    for upward in (up, (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)):
+        right = np.cross(forward, np.asarray(upward, dtype=np.float64))
+        if np.linalg.norm(right) >= 1e-6:
+            break
     right = right / np.linalg.norm(right)
     down = np.cross(forward, right)
     return from_rotation_translation(np.column_stack((right, down, forward)), eye)

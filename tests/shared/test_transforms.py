@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -94,6 +95,7 @@ def test_look_at_straight_down_and_at_itself() -> None:
     assert is_rigid(T)
     np.testing.assert_allclose(T[:3, 2], [0, 0, -1])
     np.testing.assert_allclose(T[:3, 1], [0, -1, 0])
+    assert is_rigid(transforms.look_at((0, 0, 0), (0, 1, 0), (0, 1, 0)))
     with pytest.raises(InputError, match="expected a target away from the eye"):
         transforms.look_at((1, 1, 1), (1, 1, 1))
 
@@ -126,9 +128,9 @@ def test_validated_returns_a_copy(pose: NDArray[np.float64]) -> None:
         (np.diag([0.001, 0.001, 0.001, 1.0]), "T_a_b: expected a right-handed rotation"),
     ],
 )
-def test_what_is_no_pose_is_refused(value: object, words: str) -> None:
+def test_what_is_no_pose_is_refused(value: Any, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        transforms.validated(value, "T_a_b")  # type: ignore[arg-type]
+        transforms.validated(value, "T_a_b")
 
 
 def test_pose_with_few_digits_is_taken() -> None:

@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-pipeline bench-board bench-master bench-scale bench-stance bench-paper viewer-test rehearsal pictures test lint clean libusb
+.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-accuracy bench-pipeline bench-board bench-master bench-scale bench-stance bench-paper viewer-test rehearsal pictures test lint clean libusb
 
 ARGS ?=
 EXTRAS := edge,master,realsense,sim,dev
@@ -46,6 +46,9 @@ plug-and-play: $(READY) ## four units that know nothing but a token, and what pe
 
 bench: $(BENCH_READY) libusb ## what Cellwatch claims, measured anew in some 20 minutes: benchmarks/REPORT.md
 	@$(BIN)/python -m benchmarks.bench $(ARGS)
+
+bench-accuracy: $(READY) ## curves against ground truth, beside the paper's rule and a least number of points
+	@$(BIN)/python -m benchmarks.accuracy $(ARGS)
 
 bench-pipeline: $(BENCH_READY) libusb ## what a frame costs, beside Open3D, OctoMap and Embree on the same frames
 	@$(BIN)/python -m benchmarks.pipeline $(ARGS)

@@ -17,6 +17,14 @@ In the order of the flow:
     board      how well a camera's pose is found by a calibration board
     real_frames the real recordings, and what must come out of them
     real         a real master and a real unit on them, judged frame by frame
+    accuracy_stage a camera askew to the lattice, a wall, and a thing of a known shape between them
+    accuracy_rules what is compared: ours, the paper's own rule, a least number of points
+    accuracy_truth what was reported, held against the surface that was there
+    accuracy_trials all of them before the same frames
+    accuracy_curves what came of it as curves, tables and words
+    accuracy_real the real recordings, frame by frame
+    accuracy_plan who is compared before what, and how often
+    accuracy     all of it, as one run
     source_faults what a RealSense source does when the camera makes trouble
     fault_scene  what stands before the cameras of the fault table, and which blocks it fills
     fault_unit   the edge unit before a camera whose picture may be exchanged

@@ -60,6 +60,13 @@ PARTS = (
         "How much of the known robot leaks into the map, and how much of an unknown one is missed?",
         limit_s=200.0,
     ),
+    Part(
+        "accuracy",
+        "bench-accuracy",
+        "Accuracy against ground truth",
+        "How much of what stands before a camera is found, how much that does not, and how far off is the nearest?",
+        limit_s=400.0,
+    ),
     Part("sweeps", "sweeps", "Thin, small and silent things", "How thin may a thing be, how still is a still cell?"),
     Part("right_time", "right-time", "The robot where it was", "What do late, jittering or rare joints cost?"),
     Part("board", "bench-board", "Pose by a printed board", "How exactly is a camera's pose found?"),

@@ -85,8 +85,14 @@ class RealFrames:
     def marks(self, frame: int, voxels: Voxels | NDArray[np.uint32]) -> FrameMarks:
         """Judge the filter on a watched frame, and the voxels that were reported of it."""
         keys = voxels.keys if isinstance(voxels, Voxels) else voxels
-        depth, joints = self.depth[frame], self.joints[frame]
-        survives = self.pipeline.foreground(depth, joints)
+        return self.judge(frame, self.pipeline.foreground(self.depth[frame], self.joints[frame]), keys)
+
+    def judge(self, frame: int, survives: NDArray[np.bool_], keys: NDArray[np.uint32]) -> FrameMarks:
+        """Judge any filter by the pixels (H, W) that survive it and by the voxels (N,) that it reports.
+
+        Where no second robot stands nothing of it can be missed: 0 %.
+        """
+        depth = self.depth[frame]
         robot = self.robot_mask[frame] & (depth > 0)
         second = self._second_robot(frame)
         u, v, z = self.project(keys)
@@ -95,7 +101,7 @@ class RealFrames:
         is_laptop = (u < 250) & (v > 400)
         return FrameMarks(
             robot_leak_percent=100.0 * float(survives[robot].mean()),
-            second_robot_miss_percent=100.0 * float((~survives[second]).mean()),
+            second_robot_miss_percent=100.0 * float((~survives[second]).mean()) if second.any() else 0.0,
             second_robot_voxels=int(is_second.sum()),
             false_voxels=int((~is_second & ~is_laptop).sum()),
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,6 +14,9 @@ from typing import Any
 from benchmarks.circumstances import circumstances
 
 RESULTS = Path(__file__).resolve().parent / "results"
+
+NUMBERS = re.compile(r"\[\s+((?:(?:-?\d[\d.e+-]*|null),?\s+)+)\]")
+"""A list of nothing but numbers, as `json` breaks it into lines."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +111,10 @@ def write(name: str, document: dict[str, Any], folder: Path = RESULTS) -> None:
     """Leave `document` in `folder`/`name`.json, with the circumstances under which it was `taken`."""
     folder.mkdir(parents=True, exist_ok=True)
     kept = document | {"taken": circumstances()}
-    (folder / f"{name}.json").write_text(json.dumps(kept, indent=1, allow_nan=False) + "\n")
+    text = json.dumps(kept, indent=1, allow_nan=False)
+    # What is only numbers stands in one line, so that people can read and compare it.
+    text = NUMBERS.sub(lambda found: f"[{' '.join(found[1].split())}]", text)
+    (folder / f"{name}.json").write_text(text + "\n")
 
 
 def _plain(value: str | float) -> str | float | None:

@@ -139,7 +139,7 @@ def speckle(voxel_m: float, frames: int, settings: FilterSettings) -> Tally:
     for k in range(frames):
         depth = stage.frame()
         pixels = SPECKLE_PX if k % 2 else int(rng.integers(1, SPECKLE_PX + 1))
-        rows, columns = _blob(rng, pixels, stage.intrinsics)
+        rows, columns = blob(rng, pixels, stage.intrinsics)
         # A blob is one wrong match: all of it lies at one depth, but for the noise of each pixel.
         z_m = SPECKLE_DISTANCE_M + sigma_m * (rng.standard_normal() + math.sqrt(0.1) * rng.standard_normal(pixels))
         depth[rows, columns] = np.round(z_m / stage.intrinsics.depth_scale_m).astype(np.uint16)
@@ -148,7 +148,7 @@ def speckle(voxel_m: float, frames: int, settings: FilterSettings) -> Tally:
     return Tally(f"speckle to {SPECKLE_PX} px (reported)", "D435i", SPECKLE_DISTANCE_M, voxel_m, frames, reported)
 
 
-def _blob(rng: np.random.Generator, pixels: int, intrinsics: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def blob(rng: np.random.Generator, pixels: int, intrinsics: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns (pixels,) of a random connected blob."""
     start = rng.integers(SPECKLE_MARGIN_PX, np.array(intrinsics.shape) - SPECKLE_MARGIN_PX)
     found = {(int(start[0]), int(start[1]))}

@@ -87,7 +87,7 @@ def test_the_first_rule_is_the_default_and_the_others_are_the_papers() -> None:
 def test_a_blob_is_one_piece_of_its_size() -> None:
     camera = Stage(1.0, DepthNoise.none(), 0).intrinsics
     for pixels in (1, 7, 20):
-        rows, columns = shapes._blob(np.random.default_rng(pixels), pixels, camera)
+        rows, columns = shapes.blob(np.random.default_rng(pixels), pixels, camera)
         image = np.zeros(camera.shape, bool)
         image[rows, columns] = True
         assert image.sum() == pixels

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same work by Open3D, OctoMap and Embree, each as its documentation has one do it, on one thread.
+"""The same work by Open3D, OctoMap, DUFOMap and Embree, each as its documentation has one do it, on one thread.
 
 What does not change from frame to frame they are given for nothing: rays, the CAD's expected depth, the margins.
 """
@@ -23,6 +23,16 @@ from shared.transforms import Transform, apply, inverse
 
 o3d: Any = open3d
 """Its stubs know fewer arrays than it takes."""
+
+PEERS = {
+    "Open3D": "no margin that grows beside edges, no robot of two sides, no density filter, nothing of what is seen.",
+    "OctoMap": "is given filtered points, so it pays for no robot, no CAD and no density filter; it does more in that "
+    "it casts rays and keeps probabilities of occupied and free.",
+    "DUFOMap": "is given the same points; it does more in that it marks the free space before them in UFOMap's octree, "
+    "but keeps no probabilities.",
+    "Embree": "only the expected depth, by exact rays.",
+}
+"""What each does more or less than the filter that it stands beside."""
 
 FAR_M = 60.0
 """Beyond what uint16 of millimetres can be shortened by Open3D, and 60 m on its own account."""
@@ -115,9 +125,28 @@ class OctoMap:
         self._origin_m = np.ascontiguousarray(camera.T_world_camera[:3, 3])
         self._tree = octomap.OcTree(voxel_size_m)
 
+    def insert(self, points_m: NDArray[np.float64], once: bool = False) -> None:
+        """Points (N, 3) in the world, and the free space before them; `once`: one ray for all points of a voxel."""
+        self._tree.insertPointCloud(points_m, self._origin_m, discretize=once)
+
+
+class DUFOMap:
+    """DUFOMap, on the octree of UFOMap, which is kept from frame to frame; on one thread, nothing inflated."""
+
+    def __init__(self, camera: Camera, voxel_size_m: float) -> None:
+        """Raises ImportError where there is no package of it."""
+        from dufomap import dufomap
+
+        self._pose = np.ascontiguousarray(camera.T_world_camera)
+        self._map = dufomap(voxel_size_m, 0.0, 0, num_threads=1)
+
     def insert(self, points_m: NDArray[np.float64]) -> None:
         """Points (N, 3) in the world, and the free space before them."""
-        self._tree.insertPointCloud(points_m, self._origin_m)
+        self._map.run(points_m, self._pose, False)
+
+    def in_free_space(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which of these points (N, 3) lie where a frame has looked through."""
+        return np.asarray(self._map.segment(points_m, self._pose, False), np.bool_)
 
 
 class Embree:

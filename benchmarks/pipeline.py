@@ -9,6 +9,7 @@ the caches then, as the other programs of a board do between two frames of a cam
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -34,6 +35,8 @@ TABLE_TURNS = 8
 
 ARBITRARY_RAW = (300, 2500)
 """Each pixel of the worst frame has a depth of its own from this range: no frame touches more voxels."""
+
+DUFOMAP = "DUFOMap, the same points"
 
 Work = Callable[[int], object]
 
@@ -85,7 +88,9 @@ def contenders_of(frames: Recording) -> dict[str, Work]:
     arbitrary = np.random.default_rng(0).integers(*ARBITRARY_RAW, depth.shape).astype(np.uint16)
     camera = peers.Camera(frames.intrinsics, frames.T_world_camera, frames.cell)
     open3d, embree = peers.Open3D(camera, pipeline.settings), peers.Embree(camera)
-    octomap = peers.OctoMap(camera, VOXEL_M)
+    octomap, discrete = peers.OctoMap(camera, VOXEL_M), peers.OctoMap(camera, VOXEL_M)
+    # It is made for fewer processors than the others.
+    dufomap = peers.DUFOMap(camera, VOXEL_M) if importlib.util.find_spec("dufomap") else None
     marked = [pipeline.foreground(depth[n], joints[n]) for n in range(len(depth))]
     points_m = [camera.points_m(depth[n], marked[n]) for n in range(len(depth))]
     everything = np.ones(frames.intrinsics.shape, np.bool_)
@@ -99,6 +104,8 @@ def contenders_of(frames: Recording) -> dict[str, Work]:
         "process()": lambda n: pipeline.process(depth[n], joints[n]),
         "Open3D, the same work": lambda n: open3d.process(depth[n], joints[n], VOXEL_M),
         "OctoMap, the same points": lambda n: octomap.insert(points_m[n]),
+        "OctoMap, a ray for each voxel hit": lambda n: discrete.insert(points_m[n], once=True),
+        **({DUFOMAP: lambda n: dufomap.insert(points_m[n])} if dufomap else {}),
         "expected_depth()": lambda n: pipeline.expected_depth(joints[n]),
         "Embree, the same picture": lambda n: embree.expected_depth(joints[n]),
         "Embree, the robot alone": lambda n: embree.robot_depth(joints[n]),
@@ -115,11 +122,14 @@ def contenders_of(frames: Recording) -> dict[str, Work]:
 
 def compare(frames: Recording, turns: int) -> tuple[dict[str, Any], list[Mark]]:
     """What a frame costs beside its peers: figures by name, and the marks that they are held against."""
+    from benchmarks.peers import PEERS
+
     spent = in_turns(contenders_of(frames), turns, len(frames.depth))
     result = Result(
         f"{SIZE[0]}x{SIZE[1]}, UR3, {VOXEL_M * 1e3:g} mm voxels, one thread, {turns} turns of {FRAMES_A_TURN} frames",
         ("what", "median ms", "p99 ms", "first of a turn, ms"),
         tuple((name, each.median, each.p99, each.first) for name, each in spent.items()),
+        remarks=tuple(f"{name}: {what}" for name, what in PEERS.items()),
     )
     print(result, flush=True)
 
@@ -143,6 +153,8 @@ def compare(frames: Recording, turns: int) -> tuple[dict[str, Any], list[Mark]]:
         "vs_open3d_cold": times_at_first("Open3D, the same work", "process()"),
         "vs_octomap": times("OctoMap, the same points", "process()"),
         "vs_octomap_cold": times_at_first("OctoMap, the same points", "process()"),
+        "vs_octomap_discrete": times("OctoMap, a ray for each voxel hit", "process()"),
+        **({"vs_dufomap": times(DUFOMAP, "process()")} if DUFOMAP in spent else {}),
         "filter_vs_memcpy": spent["filter"].median / spent["memcpy of two images"].median,
         "expected_depth_ms": spent["expected_depth()"].median,
         "expected_depth_vs_embree": times("Embree, the same picture", "expected_depth()"),

@@ -5,10 +5,14 @@ from __future__ import annotations
 
 import importlib.util
 
+import numpy as np
 import pytest
 
 from benchmarks import pipeline
 from benchmarks.pipeline import FRAMES_A_TURN, Spent, in_turns
+from benchmarks.ur3_scene import room
+from shared.transforms import look_at
+from simulation.camera import d435i_intrinsics
 
 needs_peers = pytest.mark.skipif(
     importlib.util.find_spec("open3d") is None or importlib.util.find_spec("octomap") is None,
@@ -30,6 +34,23 @@ def test_the_first_frame_of_a_turn_is_told_apart() -> None:
     spent.turns = [[5.0, 1.0, 1.0], [7.0, 1.0, 1.0], [6.0, 1.0, 1.0]]
     assert spent.median == 1.0
     assert spent.first == 6.0
+
+
+@pytest.mark.skipif(importlib.util.find_spec("dufomap") is None, reason="there is none for this processor")
+@needs_peers
+def test_dufomap_marks_the_space_before_what_it_is_given() -> None:
+    from benchmarks import peers
+
+    cell = room()
+    camera = peers.Camera(d435i_intrinsics(424, 240), look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), cell)
+    dufomap = peers.DUFOMap(camera, 0.05)
+    side_m = np.linspace(-0.5, 0.5, 80)
+    wall_m = np.stack(np.meshgrid([2.0], side_m, side_m), axis=-1).reshape(-1, 3)
+    for _ in range(3):
+        dufomap.insert(wall_m)
+    assert dufomap.in_free_space(0.5 * wall_m).all()
+    assert not dufomap.in_free_space(wall_m).any()
+    assert not dufomap.in_free_space(1.3 * wall_m).any()
 
 
 @needs_peers

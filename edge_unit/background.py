@@ -88,7 +88,11 @@ class BackgroundStore:
             self._label.save(label)
 
     def drop(self) -> None:
-        """Forget it."""
+        """Forget it.
+
+        Raises:
+            OSError: it cannot be removed.
+        """
         self._label.drop()
         self._images.unlink(missing_ok=True)
 

@@ -75,8 +75,12 @@ class Learning:
         """Forget what was learned, as `command` asks."""
         self.end("it was asked to drop the background")
         pipeline.use(None)
-        self._store.drop()
-        self._finish(command, DONE)
+        try:
+            self._store.drop()
+        except OSError as error:
+            self._finish(command, f"it is used no more, but comes back with the next start: {error}")
+        else:
+            self._finish(command, DONE)
 
     def end(self, outcome: str) -> None:
         """Learn no more; whoever asked for it is told the `outcome`."""

@@ -4,9 +4,10 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-accuracy bench-pipeline bench-board bench-master bench-scale bench-stance bench-paper viewer-test rehearsal pictures test lint clean libusb
+.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-accuracy bench-pipeline bench-board bench-master bench-scale bench-latency soak bench-stance bench-paper viewer-test rehearsal pictures test lint clean libusb
 
 ARGS ?=
+MINUTES ?= 30
 EXTRAS := edge,master,realsense,sim,dev
 VENV := .venv
 BIN := $(VENV)/bin
@@ -58,6 +59,12 @@ bench-master: $(READY) ## how many units one master bears, beside a bare route o
 
 bench-scale: $(READY) ## one master and more and more units, until it bends
 	@$(BIN)/python -m benchmarks.scale $(ARGS)
+
+bench-latency: $(READY) ## where the milliseconds go from the capture of a frame to a robot's map
+	@$(BIN)/python -m benchmarks.latency $(ARGS)
+
+soak: $(READY) ## all sorts of faults at once for MINUTES (30): no answer wrong, nothing grows; SEED=n for the same again
+	@$(BIN)/python -m benchmarks.soak --minutes $(MINUTES) $(if $(SEED),--seed $(SEED)) $(ARGS)
 
 bench-board: $(READY) ## how well a camera's pose is found by a calibration board, by distance
 	@$(BIN)/python -m benchmarks.board $(ARGS)

@@ -33,6 +33,11 @@ In the order of the flow:
     fault_watch  asks for the map all the time, and holds the answers against the truth
     fault_site   a master, two units and a robot, and all that may be done to them
     faults       what the map says while processes, clocks, networks and disks fail
+    soak_schedule what happens to a cell when, drawn from a seed
+    soak_usage   memory, threads and handles of processes, and what counts as growth
+    soak_unit    the edge unit before a camera that may be unplugged
+    soak_site    a cell that all sorts of things happen to at once
+    soak         for as long as is wished: no answer wrong, nothing grows
     plug_network  a switch with sockets for units, each with a network of its own
     plug_site     a master, a robot and units that are given nothing but a token
     plug_judge    where their cameras really hang, and what of their voxels is robot
@@ -50,6 +55,9 @@ In the order of the flow:
     wide_master  a master that takes more units than it should
     scale_load   more and more units before one master
     scale        one master and more and more units, until it bends
+    latency_frames what simulated cameras see, rendered beforehand
+    latency_unit the edge unit before a camera that plays such frames
+    latency      where the milliseconds go from a frame's capture to a robot's map
     viewer       the operator's window in a real browser, and what those who look cost the units
     machines     machines that boot systemd from one read-only root file system
     rehearsal    three units and a master as such machines: switched on, failing, coming back

@@ -2,7 +2,8 @@
 """Two robots that read the map: one asks for it, one listens to the stream, and both note when they had it.
 
 `python -m benchmarks.map_readers URL TOKEN_FILE ASK_S RESULT` reads until told to stop, then leaves all that it noted
-in RESULT (JSON): a list of `Reading` by reader. It runs on the master's machine, whose clock is its own.
+in RESULT (JSON): a list of `Reading` by reader. It runs on the master's machine, whose clock is its own. A file RESULT
+with the suffix BEGUN is there as soon as both have had a map.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ from shared.clock import NS_PER_S, monotonic_ns
 from shared.wire import MEDIA_TYPE
 
 ASKING, LISTENING = "GET /voxels", "WS /stream"
+
+BEGUN = ".begun"
 
 TIMEOUT_S = 2.0
 """For one answer; a stream that is silent for twice its heartbeat is gone."""
@@ -55,7 +58,7 @@ class Reader(threading.Thread):
         super().__init__(daemon=True)
         self._netloc = urlsplit(url).netloc
         self._headers = {"Authorization": f"Bearer {token}"}
-        self.stopped = threading.Event()
+        self.stopped, self.begun = threading.Event(), threading.Event()
         self.readings: list[Reading] = []
 
     def run(self) -> None:
@@ -81,6 +84,7 @@ class Reader(threading.Thread):
         self.readings.append(
             Reading(asked_ns, answer["now_ns"], had_ns, decoded_ns, len(body), len(voxels), answer["complete"], age_s)
         )
+        self.begun.set()
 
 
 class Asking(Reader):
@@ -141,12 +145,16 @@ def main() -> None:
     readers = (Asking(url, token, ask_s), Listening(url, token))
     for reader in readers:
         reader.start()
+    for reader in readers:
+        while not stopped.is_set() and not reader.begun.wait(RETRY_S):
+            continue
+    Path(result + BEGUN).touch()
     stopped.wait()
     for reader in readers:
         reader.stopped.set()
     for reader in readers:
         reader.join()
-    written = Path(f"{result}.partial")
+    written = Path(result + ".partial")
     written.write_text(json.dumps({reader.name: reader.readings for reader in readers}))
     written.rename(result)
 

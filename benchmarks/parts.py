@@ -47,6 +47,13 @@ PARTS = (
         limit_s=400.0,
     ),
     Part(
+        "latency",
+        "bench-latency",
+        "From a frame to a robot's map",
+        "Where do the milliseconds go from the capture of a frame to the map that a robot has?",
+        limit_s=240.0,
+    ),
+    Part(
         "paper",
         "bench-paper",
         "The paper's experiment",
@@ -73,6 +80,7 @@ PARTS = (
     Part("stance", "bench-stance", "Knocked and covered cameras", "How soon is it told, and how often wrongly?"),
     Part("master", "bench-master", "The master at its limit", "How many updates a second, beside a bare web service?"),
     Part("faults", "faults", "Things that fail", "What does the map say meanwhile, and how soon is it right again?"),
+    Part("soak", "soak", "All of them at once", "For as long as is wished: is any answer wrong, does anything grow?"),
     Part("source_faults", "source-faults", "Cameras that fail", "How soon is it told, and when do frames flow again?"),
     Part("plug_and_play", "plug-and-play", "Power on and forget", "How long until units that know nothing are live?"),
     Part("rehearsal", "rehearsal", "Machines that boot", "How long from power-on to the first voxel?"),

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.map_readers import ASKING, LISTENING, Reading, read
+from benchmarks.map_readers import ASKING, BEGUN, LISTENING, Reading, read
 from benchmarks.master import POLL_S, READY_S
 from benchmarks.merge_costs import MergeCost, merge_costs
 from benchmarks.report import RESULTS, Curves, Mark, Result, line, write
@@ -134,6 +134,7 @@ class Bench:
         readers = await self._processes.start(
             f"readers-{self._count}", "benchmarks.map_readers", url, operator, str(ASK_S), str(folder / "read")
         )
+        await _until(folder / f"read{BEGUN}", readers)
         options = self._options
         plan = ScalePlan(
             url, ready["unit_token_file"], str(DEMO_CELL), units, options.rates, options.voxels, options.seconds,

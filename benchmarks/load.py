@@ -195,6 +195,10 @@ class Generator:
     def send_all(self) -> None:
         """One more update from each unit, so that all of them are live."""
         for connection in self._connections:
+            connection.waiting.clear()
+            if connection.due_ns is not None:
+                # The answer to what is counted as lost must not be taken for that to this one.
+                connection.again()
             connection.waiting.append(monotonic_ns())
             connection.send(monotonic_ns() - AGE_NS)
             while (answer := connection.receive()) is None:

@@ -6,6 +6,7 @@ In the order of the flow:
 
     jit         how kernels are compiled
     int32       integers of 32 bits that stay so
+    pinhole     a point and its place in the picture
     forward     where the links stand, and how far they may be off (Algorithm 5)
     motion      which links have moved since they were drawn
     project     where meshes come to lie on the screen

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.kernels.jit import kernel
+from edge_unit.kernels.pinhole import deproject, moved, nearest_pixel, project, rows_of, rows_of_32
 
 UNKNOWN_COST = 0.5
 """Of a point that falls where nothing is known: neither does it fit, nor does it not."""
@@ -30,25 +31,23 @@ def plane_cost(
     distance from the plane there. A distance `d` counts `d**2 / (scale**2 + d**2)`, so that what is unknown and near
     counts 1 wherever the camera stands. Out: `distances_m` (N,), NaN where nothing is known.
     """
-    t = T_expected_there.astype(np.float32)
+    rows = rows_of_32(T_expected_there)
     fx, fy, cx, cy = (
         np.float32(focal_px[0]),
         np.float32(focal_px[1]),
         np.float32(centre_px[0]),
         np.float32(centre_px[1]),
     )
-    half, one = np.float32(0.5), np.float32(1.0)
+    one = np.float32(1.0)
     height, width = expected_m.shape
     total = np.float64(0.0)
     for i in range(points_m.shape[1]):
-        x, y, z = points_m[0, i], points_m[1, i], points_m[2, i]
-        there_z = t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3]
+        there_x, there_y, there_z = moved(rows, points_m[0, i], points_m[1, i], points_m[2, i])
         cost = np.float64(UNKNOWN_COST)
         distances_m[i] = np.nan
         if there_z > 0.0:
-            w = one / there_z
-            u = np.int64(np.floor((t[0, 0] * x + t[0, 1] * y + t[0, 2] * z + t[0, 3]) * w * fx + cx + half))
-            v = np.int64(np.floor((t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3]) * w * fy + cy + half))
+            u_px, v_px = project(there_x, there_y, one / there_z, fx, fy, cx, cy)
+            u, v = nearest_pixel(u_px), nearest_pixel(v_px)
             if 0 <= u < width and 0 <= v < height:
                 expected = expected_m[np.uint64(v), np.uint64(u)]
                 if np.isfinite(expected):
@@ -79,28 +78,26 @@ def normal_equations(
     """
     information[:] = 0.0
     gradient[:] = 0.0
-    t = T_expected_there
+    rows = rows_of(T_expected_there)
     fx, fy = focal_px
     cx, cy = centre_px
     height, width = expected_m.shape
     jacobian = np.empty(6)
     for i in range(points_m.shape[1]):
         x, y, z = np.float64(points_m[0, i]), np.float64(points_m[1, i]), np.float64(points_m[2, i])
-        px = t[0, 0] * x + t[0, 1] * y + t[0, 2] * z + t[0, 3]
-        py = t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3]
-        pz = t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3]
+        px, py, pz = moved(rows, x, y, z)
         if pz <= 0.0:
             continue
-        u, v = int(np.floor(px / pz * fx + cx + 0.5)), int(np.floor(py / pz * fy + cy + 0.5))
+        u_px, v_px = project(px, py, 1.0 / pz, fx, fy, cx, cy)
+        u, v = nearest_pixel(u_px), nearest_pixel(v_px)
         if not (0 <= u < width and 0 <= v < height):
             continue
         nx, ny, nz = np.float64(normals[v, u, 0]), np.float64(normals[v, u, 1]), np.float64(normals[v, u, 2])
         if not np.isfinite(nx):
             continue
         # The plane goes through the expected point of that pixel.
-        expected = np.float64(expected_m[v, u])
-        qx, qy = (u - cx) / fx * expected, (v - cy) / fy * expected
-        distance = nx * (px - qx) + ny * (py - qy) + nz * (pz - expected)
+        qx, qy, qz = deproject(u, v, np.float64(expected_m[v, u]), fx, fy, cx, cy)
+        distance = nx * (px - qx) + ny * (py - qy) + nz * (pz - qz)
         r = distance / scale_m[i]
         weight = 1.0 / (1.0 + r * r) ** 2 / scale_m[i] ** 2
         jacobian[0] = py * nz - pz * ny

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.kernels.jit import kernel
+from edge_unit.kernels.pinhole import deproject, moved, nearest_pixel, project, rows_of_32
 
 UNKNOWN_MISFIT = 0.5
 """Of a pixel that falls where nothing is known: neither does it fit, nor does it not."""
@@ -32,6 +33,8 @@ def compared_points(
     away than the surface there by more than `base + per_raw2 * expected**2`, which a correct picture cannot show.
     """
     tallies[:] = 0
+    fx, fy = focal_px
+    cx, cy = centre_px
     height, width = depth_raw.shape
     points = 0
     for y in range(stride_px // 2, height, stride_px):
@@ -48,9 +51,7 @@ def compared_points(
             z = np.float64(raw)
             if expected > 0.0 and z - expected > tolerance_base_raw + tolerance_per_raw2 * expected * expected:
                 tallies[3] += 1
-            points_raw[0, points] = (x - centre_px[0]) / focal_px[0] * z
-            points_raw[1, points] = (y - centre_px[1]) / focal_px[1] * z
-            points_raw[2, points] = z
+            points_raw[0, points], points_raw[1, points], points_raw[2, points] = deproject(x, y, z, fx, fy, cx, cy)
             points += 1
     return points
 
@@ -72,7 +73,7 @@ def misfit_there(
     from which `static_raw` (H, W) was drawn. A residual `r` in scales of `base + per_raw2 * z**2` counts
     `r**2 / (1 + r**2)`, so that what is unknown and near counts 1 wherever the camera stands.
     """
-    t = T_expected_there.astype(np.float32)
+    rows = rows_of_32(T_expected_there)
     fx, fy, cx, cy = (
         np.float32(focal_px[0]),
         np.float32(focal_px[1]),
@@ -80,17 +81,16 @@ def misfit_there(
         np.float32(centre_px[1]),
     )
     base, per = np.float32(scale_base_raw), np.float32(scale_per_raw2)
-    half, one = np.float32(0.5), np.float32(1.0)
+    one = np.float32(1.0)
     height, width = static_raw.shape
     total = np.float64(0.0)
     for i in range(points):
-        x, y, z = points_raw[0, i], points_raw[1, i], points_raw[2, i]
-        there_z = t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3]
+        z = points_raw[2, i]
+        there_x, there_y, there_z = moved(rows, points_raw[0, i], points_raw[1, i], z)
         misfit = np.float32(UNKNOWN_MISFIT)
         if there_z > 0.0:
-            w = one / there_z
-            u = np.int64(np.floor((t[0, 0] * x + t[0, 1] * y + t[0, 2] * z + t[0, 3]) * w * fx + cx + half))
-            v = np.int64(np.floor((t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3]) * w * fy + cy + half))
+            u_px, v_px = project(there_x, there_y, one / there_z, fx, fy, cx, cy)
+            u, v = nearest_pixel(u_px), nearest_pixel(v_px)
             if 0 <= u < width and 0 <= v < height:
                 expected = static_raw[np.uint64(v), np.uint64(u)]
                 if expected > 0:

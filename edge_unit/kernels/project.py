@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where meshes come to lie on the screen.
 
-Corners are rounded to `1 / SUBPIXELS` of a pixel, so that what is drawn of them can be reckoned without rounding.
-Pixel centres are at integer coordinates. `camera` (5,) is fx, fy, cx, cy in pixels and the near plane in metres.
+Conventions are those of `pinhole`. Corners are rounded to `1 / SUBPIXELS` of a pixel, so that what is drawn of them can
+be reckoned without rounding. `camera` (5,) is fx, fy, cx, cy in pixels and the near plane in metres.
 """
 
 from __future__ import annotations
@@ -13,11 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.kernels.jit import kernel
+from edge_unit.kernels.pinhole import moved, project, rows_of_32
 
 SUBPIXELS = np.float32(512.0)
 """Corners are off by a thousandth of a pixel at most; a depth camera cannot tell half a pixel."""
 
 SUBPIXEL = np.float32(1.0 / 512.0)
+
+
+@kernel
+def rounded(u_or_v: np.float32) -> np.float32:
+    """A pixel coordinate in whole subpixels."""
+    return np.float32(np.rint(u_or_v * SUBPIXELS) * SUBPIXEL)
 
 
 @kernel
@@ -39,10 +46,7 @@ def place_vertices(
 
     Written for the vectoriser: one type, no branch, each coordinate in its own array.
     """
-    t = T_camera_mesh
-    xx, xy, xz, x0 = np.float32(t[0, 0]), np.float32(t[0, 1]), np.float32(t[0, 2]), np.float32(t[0, 3])
-    yx, yy, yz, y0 = np.float32(t[1, 0]), np.float32(t[1, 1]), np.float32(t[1, 2]), np.float32(t[1, 3])
-    zx, zy, zz, z0 = np.float32(t[2, 0]), np.float32(t[2, 1]), np.float32(t[2, 2]), np.float32(t[2, 3])
+    rows = rows_of_32(T_camera_mesh)
     fx, fy, cx, cy, near_m = camera[0], camera[1], camera[2], camera[3], camera[4]
     one = np.float32(1.0)
     before = 0
@@ -50,13 +54,10 @@ def place_vertices(
         px = x_m[i] + padding_m * offset_x[i]
         py = y_m[i] + padding_m * offset_y[i]
         pz = z_m[i] + padding_m * offset_z[i]
-        x = xx * px + xy * py + xz * pz + x0
-        y = yx * px + yy * py + yz * pz + y0
-        z = zx * px + zy * py + zz * pz + z0
+        x, y, z = moved(rows, px, py, pz)
         w = one / max(z, near_m)
-        u_px[i] = np.rint((x * w * fx + cx) * SUBPIXELS) * SUBPIXEL
-        v_px[i] = np.rint((y * w * fy + cy) * SUBPIXELS) * SUBPIXEL
-        w_per_m[i] = w
+        u, v = project(x, y, w, fx, fy, cx, cy)
+        u_px[i], v_px[i], w_per_m[i] = rounded(u), rounded(v), w
         before += z < near_m
     return before
 
@@ -76,20 +77,12 @@ def bring_vertices(
     camera_z_m: NDArray[np.float32],
 ) -> None:
     """Vertices to the camera frame, reckoned as `place_vertices` does: only a mesh that is cut needs them there."""
-    t = T_camera_mesh
+    rows = rows_of_32(T_camera_mesh)
     for i in range(len(x_m)):
         px = x_m[i] + padding_m * offset_x[i]
         py = y_m[i] + padding_m * offset_y[i]
         pz = z_m[i] + padding_m * offset_z[i]
-        camera_x_m[i] = (
-            np.float32(t[0, 0]) * px + np.float32(t[0, 1]) * py + np.float32(t[0, 2]) * pz + np.float32(t[0, 3])
-        )
-        camera_y_m[i] = (
-            np.float32(t[1, 0]) * px + np.float32(t[1, 1]) * py + np.float32(t[1, 2]) * pz + np.float32(t[1, 3])
-        )
-        camera_z_m[i] = (
-            np.float32(t[2, 0]) * px + np.float32(t[2, 1]) * py + np.float32(t[2, 2]) * pz + np.float32(t[2, 3])
-        )
+        camera_x_m[i], camera_y_m[i], camera_z_m[i] = moved(rows, px, py, pz)
 
 
 @kernel
@@ -126,9 +119,8 @@ def clip(corners: NDArray[np.float32], camera: NDArray[np.float32], polygon: NDA
         if z_i >= near_m:
             # Reckoned as `place_vertices` does: a neighbour that is not cut has the same corners.
             w = np.float32(1.0) / z_i
-            polygon[count, 0] = np.rint((corners[i, 0] * w * fx + cx) * SUBPIXELS) * SUBPIXEL
-            polygon[count, 1] = np.rint((corners[i, 1] * w * fy + cy) * SUBPIXELS) * SUBPIXEL
-            polygon[count, 2] = w
+            u, v = project(corners[i, 0], corners[i, 1], w, fx, fy, cx, cy)
+            polygon[count, 0], polygon[count, 1], polygon[count, 2] = rounded(u), rounded(v), w
             count += 1
         if (z_i >= near_m) != (z_j >= near_m):
             # Always from the end in front, so that a neighbour that is cut too finds the same point.
@@ -136,9 +128,9 @@ def clip(corners: NDArray[np.float32], camera: NDArray[np.float32], polygon: NDA
             share = (near_m - corners[front, 2]) / (corners[back, 2] - corners[front, 2])
             x = corners[front, 0] + share * (corners[back, 0] - corners[front, 0])
             y = corners[front, 1] + share * (corners[back, 1] - corners[front, 1])
-            polygon[count, 0] = x / near_m * fx + cx
-            polygon[count, 1] = y / near_m * fy + cy
-            polygon[count, 2] = 1.0 / near_m
+            w = np.float32(1.0) / near_m
+            polygon[count, 0], polygon[count, 1] = project(x, y, w, fx, fy, cx, cy)
+            polygon[count, 2] = w
             count += 1
     return count
 

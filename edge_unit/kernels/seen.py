@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.kernels.jit import kernel
+from edge_unit.kernels.pinhole import moved, project, rows_of
 
 RAYS_PER_SIDE = 6
 """A block is probed by a grid of about 6 x 6 of its pixels: 5 % of them decide nothing, and it costs little."""
@@ -46,7 +47,7 @@ def block_views(
     block: `blocks` its number; `views` (., 5) first and last row, first and last column, raw depth of its far corner
     plus the noise `noise_per_m * z**2` there: what stands just inside may be measured that much behind.
     """
-    t = T_camera_world
+    rows = rows_of(T_camera_world)
     number = 0
     for ix in range(shape[0]):
         for iy in range(shape[1]):
@@ -57,13 +58,12 @@ def block_views(
                     wx = origin_m[0] + (ix + (corner & 1)) * block_size_m
                     wy = origin_m[1] + (iy + ((corner >> 1) & 1)) * block_size_m
                     wz = origin_m[2] + (iz + (corner >> 2)) * block_size_m
-                    z = t[2, 0] * wx + t[2, 1] * wy + t[2, 2] * wz + t[2, 3]
+                    x, y, z = moved(rows, wx, wy, wz)
                     z_low = min(z_low, z)
                     z_high = max(z_high, z)
                     if z < near_m:
                         break
-                    u = (t[0, 0] * wx + t[0, 1] * wy + t[0, 2] * wz + t[0, 3]) / z * fx + cx
-                    v = (t[1, 0] * wx + t[1, 1] * wy + t[1, 2] * wz + t[1, 3]) / z * fy + cy
+                    u, v = project(x, y, 1.0 / z, fx, fy, cx, cy)
                     u_low, u_high = min(u_low, u), max(u_high, u)
                     v_low, v_high = min(v_low, v), max(v_high, v)
                 far_raw = math.ceil((z_high + noise_per_m * z_high * z_high) / depth_scale_m)

@@ -32,8 +32,8 @@ SAMPLE_SHARE = 0.1
 """Spacing of the points that stand for the mesh in parts of the distance; it changes that by less than a hundredth."""
 
 SIMPLIFY_MAX_M, SIMPLIFY_SHARE = 0.002, 1.0 / 15.0
-"""How far the simplified hull may leave the grid's, in all and in parts of the distance: a millimetre less would double
-what its drawing costs."""
+"""How far the simplified hull may leave the grid's, at most and in parts of the distance: half of it would mean nearly
+twice as many triangles to draw."""
 
 LIFT = 0.25
 """By this part of it the hull is made larger beforehand: triangles between fewer corners cut off what is round."""
@@ -45,7 +45,7 @@ _hulls: dict[tuple[str, float], TriangleMesh] = {}
 
 
 def hull_around(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
-    """The outer surface at `distance_m` from `mesh`, within some 2 mm; closed, however open the mesh was.
+    """The outer surface at `distance_m` from `mesh`, within some 3 mm; closed, however open the mesh was.
 
     Takes some hundredths of a second; the same mesh has its hull at once.
 

@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-accuracy bench-pipeline bench-board bench-master bench-scale bench-latency soak bench-stance bench-paper viewer-test rehearsal pictures test lint clean libusb
+.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-accuracy bench-pipeline bench-board bench-master bench-scale bench-latency soak bench-stance bench-paper viewer-test rehearsal image-test pictures test lint clean libusb
 
 ARGS ?=
 MINUTES ?= 30
@@ -80,6 +80,9 @@ viewer-test: $(READY) ## the operator's window in a real browser, and what those
 
 rehearsal: $(READY) ## a master and three units as machines that boot from what a board is given (root, systemd-nspawn)
 	@$(BIN)/python -m benchmarks.rehearsal $(ARGS)
+
+image-test: $(READY) ## two arm64 boards boot from one image, find a master and report to it (root, QEMU)
+	@$(BIN)/python -m benchmarks.image_test $(ARGS)
 
 pictures: $(READY) ## the pictures of the README, painted anew
 	@$(BIN)/python -m simulation.picture assets/pictures/demo.png

@@ -61,6 +61,9 @@ In the order of the flow:
     viewer       the operator's window in a real browser, and what those who look cost the units
     machines     machines that boot systemd from one read-only root file system
     rehearsal    three units and a master as such machines: switched on, failing, coming back
+    image_parts  the image that arm64 boards boot in QEMU, built as a board's is
+    emulated     one such board
+    image_test   two of them boot from one image and report to a master
     paper_scene  the paper's cell: a UR3, a person, four cameras
     paper_contenders one unit at its frame, all cameras in one process, all cameras into one octree
     paper_master a real master, and what it takes to bring voxels to it

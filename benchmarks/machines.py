@@ -50,8 +50,8 @@ class MachineError(CellwatchError):
     """A machine did not do in time what it should have."""
 
 
-def until(look: Callable[[], Found], what: str, timeout_s: float) -> Found:
-    """What `look` finds, as soon as it finds anything.
+def until(look: Callable[[], Found], what: str, timeout_s: float, every_s: float = POLL_S) -> Found:
+    """What `look` finds, as soon as it finds anything; it looks again after `every_s`.
 
     Raises:
         MachineError: not within `timeout_s`.
@@ -63,7 +63,7 @@ def until(look: Callable[[], Found], what: str, timeout_s: float) -> Found:
             return found
         if monotonic_ns() > deadline_ns:
             raise MachineError(f"{what}: not within {timeout_s:g} s")
-        threading.Event().wait(POLL_S)
+        threading.Event().wait(every_s)
 
 
 def why_not() -> str | None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,7 +15,6 @@ from shared.errors import InputError
 from shared.transforms import Transform, look_at
 from simulation.depth_noise import DepthNoise, DepthSensor
 from simulation.raster import RasterRenderer
-from simulation.raycast import RaycastRenderer
 from simulation.scene import Renderer, View
 from simulation.world import World
 
@@ -76,7 +74,7 @@ class SimulatedCamera:
         self.T_world_camera = T_world_camera
         self.intrinsics = intrinsics
         self.noise = noise or DepthNoise()
-        self._renderer: Renderer = _RENDERERS[renderer](intrinsics, T_world_camera)
+        self._renderer: Renderer = _renderer(renderer, intrinsics, T_world_camera)
         self._sensor = DepthSensor(intrinsics, self.noise, seed)
 
     def look(self, t_s: float) -> View:
@@ -90,10 +88,13 @@ class SimulatedCamera:
         return SimulatedFrame(depth, view, self.world.joints_at(t_s))
 
 
-_RENDERERS: dict[RendererName, Callable[[Intrinsics, Transform], Renderer]] = {
-    "raster": RasterRenderer,
-    "raycast": RaycastRenderer,
-}
+def _renderer(name: RendererName, intrinsics: Intrinsics, T_world_camera: Transform) -> Renderer:
+    if name == "raster":
+        return RasterRenderer(intrinsics, T_world_camera)
+    # Embree exists for no ARM board, on which a simulated camera stands in for a real one.
+    from simulation.raycast import RaycastRenderer
+
+    return RaycastRenderer(intrinsics, T_world_camera)
 
 
 def d435i_intrinsics(width: int = 848, height: int = 480) -> Intrinsics:

@@ -91,6 +91,7 @@ class Bench:
         info = "cellwatch-0.1.0.dist-info"
         files = {
             "edge_unit/__init__.py": "",
+            "edge_unit/kernels/__init__.py": "",
             f"{info}/METADATA": "Metadata-Version: 2.1\nName: cellwatch\nVersion: 0.1.0\n",
             f"{info}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
         }
@@ -218,3 +219,17 @@ def test_what_is_missing_or_contradicts_itself_is_named(tmp_path: Path) -> None:
     (bench.root / "usr/lib/aarch64-linux-gnu/libusb-1.0.so.0").unlink()
     assert "libusb-1.0.so.0 is missing" in bench.customise().stderr
     assert not (bench.root / "opt").exists()
+
+
+@needs_root
+def test_kernels_are_carried_in_the_release_that_they_fit_and_kept_for_the_next_image(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    state = hashlib.sha256().hexdigest()[:12]
+    kernel = tmp_path / "kernels" / "armv8.2-a" / f"kernels-{state}" / "kernels_0" / "voxelize.py312.1.nbc"
+    kernel.parent.mkdir(parents=True)
+    kernel.write_text("compiled")
+    done = bench.customise("--kernels", str(tmp_path / "kernels"), "--keep-kernels", str(tmp_path / "kept"))
+    assert done.returncode == 0, done.stderr
+    name = kernel.relative_to(tmp_path / "kernels")
+    assert (bench.root / "opt/cellwatch/current/kernels" / name).read_text() == "compiled"
+    assert (tmp_path / "kept" / name).read_text() == "compiled"

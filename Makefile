@@ -57,7 +57,7 @@ bench-pipeline: $(BENCH_READY) libusb ## what a frame costs, beside Open3D, Octo
 bench-master: $(READY) ## how many units one master bears, beside a bare route of FastAPI
 	@$(BIN)/python -m benchmarks.master $(ARGS)
 
-bench-scale: $(READY) ## one master and more and more units, until it bends
+bench-scale: $(READY) ## one master and more and more units, until it bends: docs/scaling.md
 	@$(BIN)/python -m benchmarks.scale $(ARGS)
 
 bench-latency: $(READY) ## where the milliseconds go from the capture of a frame to a robot's map

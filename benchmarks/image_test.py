@@ -195,7 +195,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise_when_stopped()
         if built.exists():
             document |= json.loads(built.read_text())
-            began_ns = document.pop("began_ns") if not options.no_build else began_ns
+            build_began_ns = document.pop("began_ns")
+            began_ns = began_ns if options.no_build else build_began_ns
         boot(options.parts.resolve(), options.wait_s, document)
     except (CellwatchError, subprocess.CalledProcessError) as error:
         document["error"] = str(error)

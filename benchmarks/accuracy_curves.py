@@ -15,6 +15,16 @@ from benchmarks.accuracy_trials import Tallies
 from benchmarks.accuracy_truth import Tally
 from benchmarks.report import Curves, Result, table
 
+SHORT = {
+    "recall_percent": "Found",
+    "recall_strict_percent": "Found strictly",
+    "lost_percent": "Lost",
+    "false_per_1000": "False voxels",
+    "tool_median_mm": "Median error at the tool",
+    "tool_p99_mm": "99 % error at the tool",
+}
+"""Of the figures that are drawn, for titles: a picture's file is called by the beginning of its title."""
+
 CEILING = "any pixel"
 """A ceiling of what can be found, and nothing else."""
 
@@ -58,12 +68,14 @@ class Curve:
     @property
     def picture(self) -> Curves:
         """For the page; on a logarithmic axis 0 is not drawn."""
+        is_false = self.metric.key == "false_per_1000"
+        is_any = any(y > 0.0 for points in self.series.values() for _, y in points)
         return Curves(
-            f"{self.metric.label[0].upper()}{self.metric.label[1:]}: {self.subject}",
+            f"{SHORT[self.metric.key]} by {self.axis.key}, {self.subject}",
             f"{self.axis.label} ({self.axis.unit})",
-            self.metric.unit,
+            f"{self.metric.label} ({self.metric.unit})",
             self.series,
-            "y" if self.metric.key == "false_per_1000" else "",
+            "y" if is_false and is_any else "",
         )
 
     def document(self) -> dict[str, Any]:

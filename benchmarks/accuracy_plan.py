@@ -25,7 +25,7 @@ LIMIT_AT_M = 2.5
 """Where the arm stands while fixed limits vary: far enough for noise to matter."""
 
 ARM = "arm 80 mm"
-STAND_OFFS = {f"{ARM}, lying before a wall at {distance_m:g} m": distance_m for distance_m in (1.0, 2.5)}
+STAND_OFFS = {f"{ARM} before a wall at {distance_m:g} m": distance_m for distance_m in (1.0, 2.5)}
 
 BLOBS = 10
 SPECKLE = f"{BLOBS} wrong matches of up to 20 pixels a frame"

@@ -18,6 +18,7 @@ from benchmarks.accuracy_rules import Measured, MinimumPoints, Ours, Paper, Plac
 from benchmarks.accuracy_stage import THINGS, Stage
 from benchmarks.accuracy_trials import Entry
 from benchmarks.accuracy_truth import TOOL_M, Judge, Surface, Tally, visible_pixels_min
+from benchmarks.plots import draw
 from edge_unit.pipeline import DepthPipeline
 from shared.lattice import Lattice
 from shared.settings import FilterSettings
@@ -203,6 +204,8 @@ def test_a_quick_run_leaves_curves_that_explain_themselves(tmp_path: Path, capsy
     assert min(arm["contenders"][OURS]) > 95.0
     assert arm["contenders"]["paper"][-1] < 50.0
     assert len(document["curves"]) >= 10
+    files = [draw(picture, tmp_path, "accuracy") for picture in document["curves"]]
+    assert len(set(files)) == len(files)
     for picture in document["curves"]:
         assert picture["title"]
         assert picture["y_label"]

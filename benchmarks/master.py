@@ -60,9 +60,11 @@ class Bench:
         """Whether the server has a core of its own."""
         return self._server_core != self._load_core
 
-    async def at_rate(self, units: int, voxels: int, viewers: int = 0) -> dict[str, Any]:
-        """A master with so many units of 30 frames a second, and so many who look at its viewer."""
-        found = await self._run(units, voxels, FRAME_RATE_HZ, False, self._seconds, viewers)
+    async def at_rate(
+        self, units: int, voxels: int, viewers: int = 0, rate_hz: float = FRAME_RATE_HZ
+    ) -> dict[str, Any]:
+        """A master with so many units of so many frames a second, and so many who look at its viewer."""
+        found = await self._run(units, voxels, rate_hz, False, self._seconds, viewers)
         seen = found["bytes_seen"] / max(found["seen_reports"], 1)
         both = (found["bytes_out"] + found["bytes_in"] - found["bytes_seen"]) / max(found["counted"], 1)
         return {

@@ -40,6 +40,9 @@ from shared.lattice import Lattice
 ACTION_S = 5.0
 """For what an operator's own action posts to."""
 
+PLOT_PADDING_PX = (12, 16, 0, 8)
+"""Above, right, below and left of a plot."""
+
 SENTENCE_CHARS = 300
 
 SHOWN_S = 12.0
@@ -242,7 +245,9 @@ class Panel:
             title=title,
             scales={"x": {"time": True}, "y": {"auto": True}},
             legend={"show": False},
-            aspect=3.0,
+            aspect=2.4,
+            # Or else the uppermost number of an axis is cut in half.
+            padding=PLOT_PADDING_PX,
         )
 
 

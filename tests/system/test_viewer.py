@@ -30,7 +30,7 @@ from websockets.typing import Subprotocol
 from master_server.viewer.scene import STATE_COLOURS, VIEW_FOV_RAD, view_edges, view_of
 from shared.camera import Intrinsics
 from shared.transforms import apply, inverse, look_at
-from tests.system.browser import OUT, Witness, a_browser, opened, shot
+from tests.system.browser import LOAD_MS, OUT, Witness, a_browser, opened, shot
 from tests.system.cluster import CELL, START_S, Cluster, stop, until, write_cell, write_recording
 from tests.system.test_demo import running
 from tests.system.test_replay import start_replay
@@ -363,6 +363,7 @@ def test_the_units_token_lets_look_but_not_touch(cluster: TerminalCluster, brows
     witness.watch(context)
     try:
         page = context.new_page()
+        page.set_default_timeout(LOAD_MS)
         page.goto(f"{cluster.url}/viewer/login")
         page.get_by_label("token").fill(Path(cluster.unit_token_file).read_text().strip())
         page.get_by_role("button", name="Enter").click()

@@ -68,8 +68,18 @@ QUICK = Amount(
 )
 
 
-async def measure(amount: Amount) -> tuple[Book, Book, list[paper_composed.Parts]]:
-    """All that is measured: in the second book all cameras have the same frames."""
+@dataclass(frozen=True, eq=False)
+class Found:
+    """All that was measured; in what is called `same`, all cameras have the same frames."""
+
+    book: Book
+    parts: list[paper_composed.Parts]
+    same_book: Book
+    same_parts: paper_composed.Parts
+
+
+async def measure(amount: Amount) -> Found:
+    """Measure everything."""
     book, same = Book(), Book()
     parts: list[paper_composed.Parts] = []
     cores = sorted(os.sched_getaffinity(0))
@@ -89,13 +99,13 @@ async def measure(amount: Amount) -> tuple[Book, Book, list[paper_composed.Parts
                         parts += await bench.run(amount.sizes_m, amount.rounds, amount.octree_rounds)
                 with _told("all cameras with the same frames"):
                     bench = paper_composed.Bench(site, seen[-1].of_one(0), UNITS_SAME_FRAMES, same)
-                    await bench.run((VOXEL_M,), amount.same_rounds, {})
+                    (same_parts,) = await bench.run((VOXEL_M,), amount.same_rounds, {})
             finally:
                 os.sched_setaffinity(0, cores)
             site.pin(set(cores))
             with _told("units as processes"):
                 await _run_units(site, seen, folder, amount, book)
-    return book, same, parts
+    return Found(book, parts, same, same_parts)
 
 
 async def _run_units(site: paper_master.Site, seen: Sequence[Views], folder: Path, amount: Amount, book: Book) -> None:
@@ -105,8 +115,9 @@ async def _run_units(site: paper_master.Site, seen: Sequence[Views], folder: Pat
             await bench.run(amount.running_sizes_m, amount.running_rounds)
 
 
-def results_of(book: Book, same: Book, parts: Sequence[paper_composed.Parts]) -> dict[str, Result]:
+def results_of(found: Found) -> dict[str, Result]:
     """The tables, by name."""
+    book, parts = found.book, found.parts
     voxel_mm = in_mm(VOXEL_M)
     largest = parts[-1].resolution
     (default,) = [each for each in parts if (each.resolution, each.voxel_mm) == (largest, voxel_mm)]
@@ -116,10 +127,11 @@ def results_of(book: Book, same: Book, parts: Sequence[paper_composed.Parts]) ->
         by_cameras.title,
         by_cameras.columns,
         by_cameras.rows,
-        tables.marks(book, same, largest, voxel_mm),
+        tables.marks(book, found.same_parts),
         (
             f"With different views, {largest}, {voxel_mm} mm: four cameras take {first:.2f} refreshes of the first "
             f"alone, {slowest:.2f} of the slowest alone.",
+            f"With the same frames: {tables.more_of_four(found.same_parts)}",
         ),
     )
     return {
@@ -167,14 +179,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (CellwatchError, ImportError) as error:
         print(f"make bench-paper: {error}", file=sys.stderr)
         return 1
-    results = results_of(*found)
+    results = results_of(found)
     print("\n".join(f"\n{result}" for result in results.values()))
-    book, same, _ = found
+    same_rows = [row for row in found.same_book.rows() if row["contender"] == UNITS_SAME_FRAMES]
     document: dict[str, Any] = {
         **{name: result.document() for name, result in results.items()},
-        **{name: curves.document() for name, curves in curves_of(book).items()},
+        **{name: curves.document() for name, curves in curves_of(found.book).items()},
         "stated_by_the_paper": tables.STATED,
-        "measurements": [*book.rows(), *(row for row in same.rows() if row["contender"] == UNITS_SAME_FRAMES)],
+        "measurements": [*found.book.rows(), *same_rows],
         "passed": all(mark.met for result in results.values() for mark in result.marks),
         "quick": options.quick,
     }

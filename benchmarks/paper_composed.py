@@ -98,6 +98,7 @@ class Bench:
         if octree is not None:
             octree.resize(size_m)
         parts = Parts(views.name, in_mm(size_m))
+        self._merged = MergedMap(self._work[0].pipeline.lattice)
         # As the daemon does: what is there now stays, and is not looked through again.
         gc.collect()
         gc.freeze()
@@ -146,7 +147,9 @@ class Bench:
             unit_ms.append((looked_ns - began_ns) / NS_PER_MS)
             trip_ms.append((told_ns - looked_ns) / NS_PER_MS)
         rush.run([None] * CAMERAS)
-        rush_ms, merge_ms, map_ms, merged = [], [], [], MergedMap(self._work[0].pipeline.lattice)
+        rush_ms, merge_ms, map_ms, merged = [], [], [], self._merged
+        for count in range(1, CAMERAS + 1):
+            merged.withdraw(count)
         for count in range(1, CAMERAS + 1):
             rush_ms.append(rush.run(sights[:count]))
             merged.replace(count, sights[count - 1].voxels)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from benchmarks import paper
-from benchmarks.paper_book import ONE_PROCESS, UNITS_COMPOSED, UNITS_SAME_FRAMES, Book, Key
+from benchmarks.paper_book import ONE_PROCESS, UNITS_COMPOSED, Book, Key
 from benchmarks.paper_composed import Parts
 from benchmarks.paper_contenders import Centralised, IntoOctree, prepared
 from benchmarks.paper_scene import CAMERAS, Views, views, write_cell
@@ -74,9 +74,13 @@ def test_tables_tell_medians_and_leave_out_what_was_not_measured() -> None:
 def test_marks_compare_what_they_say() -> None:
     book = book_of(UNITS_COMPOSED, {0: [1.0, 1.0, 1.0, 6.0]}, 0.01)
     book.add(UNITS_COMPOSED, "424x240", 0.05, [1.0, 1.0, 1.0, 4.0])
-    same = book_of(UNITS_SAME_FRAMES, {0: [5.0, 5.0, 5.0, 5.5]})
-    four, small = marks(book, same, "424x240", 20)
-    assert (four.value, four.met) == (pytest.approx(1.1), True)
+    same = Parts("424x240", 20)
+    same.unit_ms, same.trip_ms = [[4.0, 4.0, 4.1, 3.9]], [[0.9, 0.9, 0.9, 0.9]]
+    same.rush_ms, same.merge_ms = [[1.0, 1.0, 1.0, 1.3]], [[0.1, 0.1, 0.1, 0.2]]
+    four, small = marks(book, same)
+    assert four.why is not None
+    assert "without that it would be 1.04 times" in four.why
+    assert (four.value, four.met) == (pytest.approx(5.5 / 5.0), True)
     assert (small.value, small.met) == (pytest.approx(1.5), True)
 
 

@@ -11,6 +11,7 @@ missed. Needs root.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import re
@@ -29,6 +30,7 @@ import httpx
 from benchmarks.fault_network import run
 from benchmarks.machines import Machine, MachineError, confine, make_network, until, why_not
 from benchmarks.report import Mark, line, table, write
+from edge_unit.master_search import FILE_NAME
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, ConfigError
 from simulation.processes import raise_when_stopped
@@ -148,11 +150,13 @@ def join(site: Site) -> dict[str, Any]:
     names = [unit.run("hostname").strip() for unit in site.units]
     keys = [unit.run("cat", "/etc/ssh/ssh_host_ed25519_key.pub").strip() for unit in site.units]
     ids = [unit.run("cat", "/etc/machine-id").strip() for unit in site.units]
+    masters = [json.loads(unit.run("cat", f"/var/lib/cellwatch-unit/{FILE_NAME}")) for unit in site.units]
     return {
         "machines_posting": sum(site.live(unit) for unit in site.units),
         "distinct_names": len(set(names)),
         "distinct_host_keys": len(set(keys)),
         "distinct_machine_ids": len(set(ids)),
+        "found_by_mdns": sum(master["found_by"].startswith("announced") for master in masters),
         "names": names,
     }
 
@@ -355,6 +359,7 @@ def marks(document: dict[str, Any]) -> list[Mark]:
         Mark("seconds from power-on to the first voxel, later boots", on["warm_s"], at_most=WARM_S_MAX),
         Mark("units that report", joined["machines_posting"], at_least=3),
         Mark("distinct host names", joined["distinct_names"], at_least=3),
+        Mark("units that found their master by multicast DNS", joined["found_by_mdns"], at_least=3),
         Mark("seconds to stop", document["stop_s"], at_most=2.0),
         *(Mark(f"{row['fault']}: seconds until live", row["back_s"], row["back_s_max"]) for row in document["faults"]),
     ]

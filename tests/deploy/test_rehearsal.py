@@ -33,7 +33,8 @@ def test_machines_come_back_by_themselves_whatever_befalls_them() -> None:
     assert done.stdout, done.stderr
     document = json.loads(done.stdout.splitlines()[-1])
     joined = document["join"]
-    assert [joined[key] for key in ("machines_posting", "distinct_names", "distinct_host_keys")] == [3, 3, 3]
+    for count in ("machines_posting", "found_by_mdns", "distinct_names", "distinct_host_keys", "distinct_machine_ids"):
+        assert joined[count] == 3, count
     # How soon is for `make rehearsal` on a quiet computer; here, that it happens at all, and without anyone's help.
     assert len(document["faults"]) == 8
     assert all(row["back_s"] <= 10 * row["back_s_max"] for row in document["faults"]), done.stdout

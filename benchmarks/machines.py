@@ -12,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -75,10 +76,29 @@ def why_not() -> str | None:
             return f"{command} is not installed"
     if not allowed(NAMESPACES):
         return "the kernel does not allow network, mount and process namespaces"
+    if (trouble := _container_trouble()) is not None:
+        return f"systemd-nspawn starts no container here: {trouble}"
     bridge = ("unshare", "--net", "ip", "link", "add", BRIDGE, "type", "bridge")
     if subprocess.run(bridge, capture_output=True, check=False).returncode:
         return "the kernel has no bridge"
     return None
+
+
+def _container_trouble() -> str | None:
+    """What keeps the smallest of containers from running `true`."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("bin", "lib", "lib64", "sbin"):
+            (Path(folder) / name).symlink_to(f"usr/{name}")
+        (Path(folder) / "usr").mkdir()
+        probe = ("systemd-nspawn", "--quiet", "--register=no", "--keep-unit", f"--directory={folder}", "--bind-ro=/usr")
+        done = subprocess.run(
+            (*NAMESPACES, *probe, "--machine=probe", "--private-network", "--console=pipe", "/usr/bin/true"),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    return done.stderr.strip() if done.returncode else None
 
 
 def confine(module: str, arguments: Sequence[str]) -> None:
@@ -107,6 +127,8 @@ class Machine:
     ip: str
     folder: Path
     binds: tuple[str, ...] = ()
+    volatile: bool = True
+    """Whether what it writes outside of `PERSISTENT` is gone when its power is cut, and its root stays as it is."""
     _nspawn: subprocess.Popen[bytes] | None = field(default=None, init=False)
     _leader: int = field(default=0, init=False)
 
@@ -127,6 +149,7 @@ class Machine:
             MachineError: it does not come up.
             ConfigError: its network cannot be set up.
         """
+        volatile = ["--volatile=overlay"] if self.volatile else []
         binds = [f"--bind={self.folder / name}:{path}" for name, path in PERSISTENT.items()]
         binds += [f"--bind-ro={bind}" for bind in self.binds]
         began_ns = monotonic_ns()
@@ -134,7 +157,7 @@ class Machine:
             self._nspawn = subprocess.Popen(
                 [
                     "systemd-nspawn", "--quiet", "--register=no", "--keep-unit", f"--machine={self.name}",
-                    f"--directory={self.root}", "--volatile=overlay", "--boot", "--console=read-only",
+                    f"--directory={self.root}", *volatile, "--boot", "--console=read-only",
                     f"--network-bridge={BRIDGE}", *binds,
                 ],
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log,
@@ -161,7 +184,7 @@ class Machine:
             # The cable goes with the namespace, which the kernel takes away a moment later.
             until(lambda: not Path(f"/sys/class/net/vb-{self.name}").exists(), f"{self.name}: its end", COMMAND_S)
 
-    def run(self, *command: str) -> str:
+    def run(self, *command: str, timeout_s: float = COMMAND_S) -> str:
         """What a command in it prints.
 
         Raises:
@@ -169,9 +192,9 @@ class Machine:
         """
         inside = ("nsenter", f"--target={self._leader}", "--all", "--", *command)
         try:
-            done = subprocess.run(inside, capture_output=True, text=True, timeout=COMMAND_S, check=False)
+            done = subprocess.run(inside, capture_output=True, text=True, timeout=timeout_s, check=False)
         except subprocess.TimeoutExpired as error:
-            raise MachineError(f"{self.name}: {' '.join(command)} did not end within {COMMAND_S:g} s") from error
+            raise MachineError(f"{self.name}: {' '.join(command)} did not end within {timeout_s:g} s") from error
         if done.returncode:
             raise MachineError(f"{self.name}: {' '.join(command)}: {done.stderr.strip() or done.stdout.strip()}")
         return done.stdout

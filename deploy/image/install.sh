@@ -9,14 +9,17 @@ here=$(cd "$(dirname "$0")" && pwd)
 
 "$here/customize-rootfs" / "$@"
 
-service=edge-unit
-case " $* " in *" --role master "*) service=master-server ;; esac
 systemctl daemon-reload
 systemctl restart systemd-journald.service
-if [ "$service" = edge-unit ]; then
+# A container has no udev, and no cameras.
+if [ -f /etc/udev/rules.d/70-cellwatch-realsense.rules ] && [ -S /run/udev/control ]; then
     udevadm control --reload
     # Cameras that are plugged in already.
     udevadm trigger --subsystem-match=usb --subsystem-match=hidraw
 fi
-systemctl restart "$service.service"
-systemctl --no-pager --lines=5 status "$service.service"
+# A master beside a unit runs the same release.
+for service in master-server.service edge-unit.service; do
+    [ -f "/etc/systemd/system/$service" ] || continue
+    systemctl restart "$service"
+    systemctl --no-pager --lines=5 status "$service"
+done

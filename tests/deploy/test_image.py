@@ -23,6 +23,8 @@ LOCKS = sorted((IMAGE / "locks").glob("*.txt"))
 TOKEN = "unit-token-0123456789abcdef"
 AARCH64, X86_64 = 183, 62
 
+KERNELS = ""
+
 needs_root = pytest.mark.skipif(
     os.geteuid() != 0 or shutil.which("systemd-sysusers") is None, reason="needs root and systemd's tools"
 )
@@ -91,7 +93,7 @@ class Bench:
         info = "cellwatch-0.1.0.dist-info"
         files = {
             "edge_unit/__init__.py": "",
-            "edge_unit/kernels/__init__.py": "",
+            "edge_unit/kernels/__init__.py": KERNELS,
             f"{info}/METADATA": "Metadata-Version: 2.1\nName: cellwatch\nVersion: 0.1.0\n",
             f"{info}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
         }
@@ -109,6 +111,16 @@ class Bench:
     def customise(self, *options: str) -> subprocess.CompletedProcess[str]:
         command = [str(IMAGE / "customize-rootfs"), str(self.root), "--wheelhouse", str(self.wheels), *options]
         return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    def compile_kernels(self, source: str, python: str = "py312") -> str:
+        """What `edge-unit compile-kernels` leaves, for kernels of this source."""
+        state = hashlib.sha256(source.encode()).hexdigest()[:12]
+        kernels = self.folder / f"compiled-{state}-{python}"
+        place = kernels / "armv8.2-a" / f"kernels-{state}" / "kernels_0123"
+        place.mkdir(parents=True)
+        (place / f"points.count-1.{python}.1.nbc").write_bytes(b"code")
+        (place / f"points.count-1.{python}.nbi").write_bytes(b"index")
+        return str(kernels)
 
     def tree(self) -> dict[str, tuple[int, int, bytes]]:
         """What lies there, but for compiled bytecode."""
@@ -233,3 +245,61 @@ def test_kernels_are_carried_in_the_release_that_they_fit_and_kept_for_the_next_
     name = kernel.relative_to(tmp_path / "kernels")
     assert (bench.root / "opt/cellwatch/current/kernels" / name).read_text() == "compiled"
     assert (tmp_path / "kept" / name).read_text() == "compiled"
+
+
+@needs_root
+def test_kernels_of_the_same_release_go_along(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    done = bench.customise("--kernels", bench.compile_kernels(KERNELS))
+    assert done.returncode == 0, done.stderr
+    carried = list((bench.root / "opt/cellwatch/current/kernels").rglob("*.nbc"))
+    assert [path.read_bytes() for path in carried] == [b"code"]
+    assert all(path.stat().st_mode & 0o777 == 0o644 and path.stat().st_uid == 0 for path in carried)
+    for other in (bench.compile_kernels("# others\n"), bench.compile_kernels(KERNELS, "py310")):
+        refused = bench.customise("--kernels", other)
+        assert "its kernels are of another release or another Python" in refused.stderr
+        assert refused.returncode == 1
+    assert list((bench.root / "opt/cellwatch/current/kernels").rglob("*.nbc")) == carried
+    assert "expected a folder that edge-unit compile-kernels filled" in bench.customise("--kernels", "nowhere").stderr
+
+
+@needs_root
+def test_where_they_cannot_be_compiled_the_board_does_it(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    done = bench.customise()
+    assert done.returncode == 0
+    assert "each board compiles its kernels at its first start" in done.stderr
+    assert not list((bench.root / "opt/cellwatch/current").glob("kernels*"))
+    assert "compiles" not in bench.customise("--kernels", "none").stderr
+
+
+@needs_root
+def test_a_board_that_is_master_and_unit_needs_the_wheels_of_both(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    assert bench.customise().returncode == 0
+    (bench.folder / "cell").mkdir()
+    cell = bench.put_beside("cell/cell.yaml", "name: cell\n")
+    refused = bench.customise("--role", "master", "--cell", str(Path(cell).parent))
+    assert "master-server is to run there: build the wheelhouse with --extras edge,realsense,master" in refused.stderr
+    assert not (bench.root / "etc/systemd/system/master-server.service").exists()
+
+
+@needs_root
+def test_the_tree_of_linux_for_tegra_is_customised_in_place(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    tegra = tmp_path / "Linux_for_Tegra"
+    tegra.mkdir()
+    bench.root = bench.root.rename(tegra / "rootfs")
+    command = [str(IMAGE / "build-image"), "--l4t", str(tegra), "--", "--wheelhouse", str(bench.wheels)]
+    command += ["--token", str(tmp_path / "unit.token")]
+    early = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (early.returncode, "run NVIDIA's apply_binaries.sh first" in early.stderr) == (1, True)
+    assert not (bench.root / "opt").exists()
+    bench.put("etc/nv_tegra_release", "# R36 (release), REVISION: 4.3\n")
+    (bench.root / "etc/systemd/system").mkdir(parents=True, exist_ok=True)
+    bench.put("etc/systemd/system/nv-oem-config.service", "[Service]\nExecStart=/bin/true\n")
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "l4t_initrd_flash.sh" in done.stdout
+    assert (bench.root / "etc/systemd/system/multi-user.target.wants/edge-unit.service").is_symlink()
+    assert os.readlink(bench.root / "etc/systemd/system/nv-oem-config.service") == "/dev/null"

@@ -87,12 +87,7 @@ class Site:
             variables=variables,
         )  # fmt: skip
 
-        def look() -> Any:
-            if self.master.ended:
-                raise FaultError(f"the master did not start: {self.master.ended}; {self.master.log_tail()}")
-            return json.loads(ready_file.read_bytes()) if ready_file.exists() else None
-
-        ready = await until(look, "the master")
+        ready = await listening(self.master, ready_file)
         self.port = ready["port"]
         self.unit_token, operator_token = (Path(ready[f"{role}_token_file"]) for role in ("unit", "operator"))
         self.operator = httpx.AsyncClient(
@@ -235,6 +230,21 @@ def registered(unit: Child) -> bool:
     if unit.failed:
         raise FaultError(f"{unit.name}: {unit.ended}; {unit.log_tail()}")
     return b"registered at" in unit.log.read_bytes()
+
+
+async def listening(master: Child, ready_file: Path) -> Any:
+    """What a master writes that can be asked from now on.
+
+    Raises:
+        FaultError: it ends instead, or takes too long.
+    """
+
+    def look() -> Any:
+        if master.ended:
+            raise FaultError(f"the master did not start: {master.ended}; {master.log_tail()}")
+        return json.loads(ready_file.read_bytes()) if ready_file.exists() else None
+
+    return await until(look, "the master")
 
 
 async def until(

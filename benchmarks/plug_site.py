@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-import json
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,7 @@ import httpx
 import numpy as np
 import yaml
 
-from benchmarks.fault_site import FaultError, until
+from benchmarks.fault_site import FaultError, listening
 from benchmarks.plug_network import Socket, Switch
 from edge_unit.config import ENVIRONMENT_PREFIX as UNIT_PREFIX
 from edge_unit.sources.simulated import SimulatedSourceConfig
@@ -93,12 +92,7 @@ class PlugSite:
             *("--state-dir", str(self.folder / "master"), "--ready-file", str(ready_file)),
         )  # fmt: skip
 
-        def look() -> Any:
-            if self.master.ended:
-                raise FaultError(f"the master did not start: {self.master.ended}; {self.master.log_tail()}")
-            return json.loads(ready_file.read_bytes()) if ready_file.exists() else None
-
-        ready = await until(look, "the master")
+        ready = await listening(self.master, ready_file)
         self.url = f"http://{self.switch.address}:{PORT}"
         self.unit_token, self.operator_token = (Path(ready[f"{role}_token_file"]) for role in ("unit", "operator"))
         self.client = httpx.AsyncClient(base_url=self.url, trust_env=False)

@@ -17,9 +17,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import accuracy_plan, accuracy_real, real_frames
-from benchmarks.accuracy_curves import EVERYTHING, Collection, Curve, by_thing, tables, worse
-from benchmarks.accuracy_plan import (
+from benchmarks import real_frames
+from benchmarks.judging import plan, real
+from benchmarks.judging.curves import EVERYTHING, Collection, Curve, by_thing, tables, worse
+from benchmarks.judging.plan import (
     ARM,
     BASELINES,
     CONTENDERS,
@@ -32,11 +33,11 @@ from benchmarks.accuracy_plan import (
     Amount,
     AnyTrial,
 )
-from benchmarks.accuracy_real import Judged
-from benchmarks.accuracy_rules import MinimumPoints, Paper, Place
-from benchmarks.accuracy_stage import Stage
-from benchmarks.accuracy_trials import Tallies, Trial
-from benchmarks.accuracy_truth import visible_pixels_min
+from benchmarks.judging.real import Judged
+from benchmarks.judging.rules import MinimumPoints, Paper, Place
+from benchmarks.judging.stage import Stage
+from benchmarks.judging.trials import Tallies, Trial
+from benchmarks.judging.truth import visible_pixels_min
 from benchmarks.report import RESULTS, Mark, line, write
 from benchmarks.sweeps import runner
 from shared.clock import NS_PER_S, monotonic_ns
@@ -106,8 +107,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     curves = collection.curves()
     _print(curves)
-    marks = [*marks_of(collection, amount, parts), *(accuracy_real.marks(judged, OURS) if judged else [])]
-    told = [worse(curves, OURS, BASELINES), *(accuracy_real.results(judged, OURS) if judged else [])]
+    marks = [*marks_of(collection, amount, parts), *(real.marks(judged, OURS) if judged else [])]
+    told = [worse(curves, OURS, BASELINES), *(real.results(judged, OURS) if judged else [])]
     took_s = (monotonic_ns() - begun_ns) / NS_PER_S
     print("\n\n".join(map(str, told)), "\n")
     print("\n".join([*REMARKS, "", *map(str, marks), f"({took_s:.0f} s)"]))
@@ -133,10 +134,10 @@ def run(
     for part in sorted(parts, key=lambda part: part != "size"):
         if part != REAL:
             trials += TRIALS[part](amount, settings)
-    fixed: accuracy_real.Fixed = {accuracy_plan.PAPER: Paper(), accuracy_plan.POINTS: MinimumPoints()}
+    fixed: real.Fixed = {plan.PAPER: Paper(), plan.POINTS: MinimumPoints()}
     jobs: list[Callable[[], Any]] = [trial.run for trial in trials]
     if REAL in parts:
-        jobs.insert(0, partial(accuracy_real.watch, OURS, fixed, settings, amount.held_out))
+        jobs.insert(0, partial(real.watch, OURS, fixed, settings, amount.held_out))
     print(f"{len(jobs)} trials by {processes} processes ...", flush=True)
     with runner(processes) as do:
         found = do(jobs)
@@ -161,14 +162,14 @@ def marks_of(collection: Collection, amount: Amount, parts: Sequence[str]) -> li
             marks.append(Mark(f"{thing}, {span}: visible voxels found, %, worst", found, at_least=FOUND_MIN_PERCENT))
             marks.append(Mark(f"{thing}, {span}: frames that lose it", lost, at_most=0))
     if "size" in parts:
-        speckle = collection.tally("threshold", accuracy_plan.SPECKLE, OURS, FilterSettings().occupancy_threshold)
+        speckle = collection.tally("threshold", plan.SPECKLE, OURS, FilterSettings().occupancy_threshold)
         marks.append(Mark("wrong matches that are reported, voxels", speckle.false, at_most=0))
     if "wall" in parts:
         walls = [each for each in amount.walls_m if each <= MARKED_TO_M]
-        false = sum(collection.tally("wall", accuracy_plan.WALL, OURS, wall_m).false for wall_m in walls)
+        false = sum(collection.tally("wall", plan.WALL, OURS, wall_m).false for wall_m in walls)
         marks.append(Mark(f"an empty wall to {MARKED_TO_M:g} m: false voxels", false, at_most=0))
     if "quiet" in parts:
-        moving = collection.tally("quiet", accuracy_plan.QUIET, OURS)
+        moving = collection.tally("quiet", plan.QUIET, OURS)
         share = 100.0 * moving.false_frames / moving.frames
         marks.append(Mark("a robot that moves alone: frames with false voxels, %", share, at_most=FALSE_FRAMES_MAX))
     return marks
@@ -181,7 +182,7 @@ def document_of(curves: list[Curve], amount: Amount, settings: FilterSettings) -
     if any(curve.axis.key == "distance" for curve in curves):
         pictures += [
             by_thing(curves, "distance", "recall_strict_percent", OURS, amount.things),
-            by_thing(curves, "distance", "recall_percent", accuracy_plan.PAPER, amount.things),
+            by_thing(curves, "distance", "recall_percent", plan.PAPER, amount.things),
         ]
     stage = Stage(1.0, 1.0, DepthNoise(), 0)
     place = Place(stage.intrinsics, stage.T_world_camera, stage.cell)
@@ -196,9 +197,8 @@ def document_of(curves: list[Curve], amount: Amount, settings: FilterSettings) -
             "N by distance (m), 50 mm voxels": {
                 f"{distance_m:g}": visible_pixels_min(place, size_m, distance_m) for distance_m in amount.distances_m
             },
-            f"N by voxel (mm), at {accuracy_plan.NEAR_M:g} m": {
-                f"{1e3 * each_m:g}": visible_pixels_min(place, each_m, accuracy_plan.NEAR_M)
-                for each_m in amount.voxels_m
+            f"N by voxel (mm), at {plan.NEAR_M:g} m": {
+                f"{1e3 * each_m:g}": visible_pixels_min(place, each_m, plan.NEAR_M) for each_m in amount.voxels_m
             },
             "found within a voxel": "it or one of its 26 neighbours is reported",
             "found strictly": "it is reported itself",

@@ -23,10 +23,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.fault_clock import WallClock, monotonic_elsewhere
-from benchmarks.fault_network import UNIT_IP, Cable, Proxy, confine, run
-from benchmarks.fault_site import ADDRESSES, SERIALS, FaultError, Site, registered, until
-from benchmarks.fault_watch import (
+from benchmarks.faulting.clock import WallClock, monotonic_elsewhere
+from benchmarks.faulting.network import UNIT_IP, Cable, Proxy, confine, run
+from benchmarks.faulting.site import ADDRESSES, SERIALS, FaultError, Site, registered, until
+from benchmarks.faulting.watch import (
     NOTICED_S_MAX,
     POLL_S,
     RECOVERED_S_MAX,

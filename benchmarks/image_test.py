@@ -21,10 +21,10 @@ from typing import Any
 
 import httpx
 
-from benchmarks.emulated import Board, why_no_boards
-from benchmarks.fault_network import allowed, run
-from benchmarks.image_parts import CACHE, CELL, build, why_not_built
-from benchmarks.machines import BRIDGE, NAMESPACES, MachineError, confine, until
+from benchmarks.booting.emulated import Board, why_no_boards
+from benchmarks.booting.image_parts import CACHE, CELL, build, why_not_built
+from benchmarks.booting.machines import BRIDGE, NAMESPACES, MachineError, confine, until
+from benchmarks.faulting.network import allowed, run
 from benchmarks.report import line, write
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, ConfigError

@@ -2,7 +2,7 @@
 """`make bench-latency`: where the milliseconds go from the capture of a frame to the map that a robot has.
 
 Four real units, a master, the robot's controller and two robots that read the map, all on this machine, whose
-processes share one clock. Cameras play frames that were rendered before (`latency_frames`): neither a renderer nor a
+processes share one clock. Cameras play frames that were rendered before (`timing.frames`): neither a renderer nor a
 disk takes time from what is measured; what a real camera takes to expose and to transfer is not in it either. Prints
 the tables, and at the end all of it as one line of JSON; exits with 1 when a mark is missed.
 """
@@ -25,10 +25,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from benchmarks.latency_frames import FRAMES, PERIOD_S, RING_HZ, prepare
-from benchmarks.map_readers import ASKING, BEGUN, LISTENING, Reading, read
+from benchmarks.loading.map_readers import ASKING, BEGUN, LISTENING, Reading, read
 from benchmarks.report import RESULTS, Mark, Result, line, write
 from benchmarks.sweeps import runner
+from benchmarks.timing.frames import FRAMES, PERIOD_S, RING_HZ, prepare
 from edge_unit.config import ENVIRONMENT_PREFIX as UNIT_PREFIX
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from edge_unit.trace import TraceRecord, read_trace
@@ -188,10 +188,10 @@ class Bench:
             }
             config = state / "unit.yaml"
             config.write_text(yaml.safe_dump(document))
-            units.append(await self._start(f"unit{camera + 1}", "benchmarks.latency_unit", str(config)))
+            units.append(await self._start(f"unit{camera + 1}", "benchmarks.timing.unit", str(config)))
         await self._all_live(url, (master, robot, *units))
         await asyncio.sleep(SETTLE_S)
-        readers = await self._start("readers", "benchmarks.map_readers", url, operator, str(ASK_S), str(result))
+        readers = await self._start("readers", "benchmarks.loading.map_readers", url, operator, str(ASK_S), str(result))
         await _until(result.with_suffix(BEGUN).exists, readers)
         began_ns = monotonic_ns()
         await asyncio.sleep(self._seconds + TAIL_S)

@@ -19,7 +19,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from benchmarks.load import FRAME_RATE_HZ, Plan
+from benchmarks.loading.load import FRAME_RATE_HZ, Plan
 from benchmarks.report import RESULTS, Mark, Result, line, write
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, UplinkError
@@ -114,7 +114,7 @@ class Bench:
         result.unlink(missing_ok=True)
         (self._folder / "plan.json").write_text(json.dumps(asdict(plan)))
         load = await self._processes.start(
-            "load", "benchmarks.load", str(self._folder / "plan.json"), str(result), may_end=True
+            "load", "benchmarks.loading.load", str(self._folder / "plan.json"), str(result), may_end=True
         )
         await load.process.wait()
         failed = [child for child in (*children, load) if child.failed]
@@ -131,7 +131,7 @@ class Bench:
         seeing.unlink(missing_ok=True)
         watchers = await self._processes.start(
             "watchers",
-            "benchmarks.watchers",
+            "benchmarks.loading.watchers",
             *(ready["url"], ready["operator_token_file"], str(ready["pid"]), str(viewers), str(seeing)),
         )
         deadline_ns = monotonic_ns() + round(READY_S * NS_PER_S)
@@ -145,7 +145,9 @@ class Bench:
         ready_file = self._folder / "ready.json"
         ready_file.unlink(missing_ok=True)
         if bare:
-            server = await self._processes.start("bare", "benchmarks.bare_fastapi", "--ready-file", str(ready_file))
+            server = await self._processes.start(
+                "bare", "benchmarks.loading.bare_fastapi", "--ready-file", str(ready_file)
+            )
         else:
             server = await self._processes.start(
                 "master",

@@ -18,9 +18,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks import paper_composed, paper_master, paper_running
-from benchmarks import paper_tables as tables
-from benchmarks.paper_book import (
+from benchmarks.repeating import composed, master, running
+from benchmarks.repeating import tables as tables
+from benchmarks.repeating.book import (
     CONTENDERS,
     ONE_OCTREE,
     ONE_PROCESS,
@@ -31,7 +31,7 @@ from benchmarks.paper_book import (
     Book,
     in_mm,
 )
-from benchmarks.paper_scene import Views, views, write_cell
+from benchmarks.repeating.scene import Views, views, write_cell
 from benchmarks.report import RESULTS, Curves, Result, line, write
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError
@@ -73,15 +73,15 @@ class Found:
     """All that was measured; in what is called `same`, all cameras have the same frames."""
 
     book: Book
-    parts: list[paper_composed.Parts]
+    parts: list[composed.Parts]
     same_book: Book
-    same_parts: paper_composed.Parts
+    same_parts: composed.Parts
 
 
 async def measure(amount: Amount) -> Found:
     """Measure everything."""
     book, same = Book(), Book()
-    parts: list[paper_composed.Parts] = []
+    parts: list[composed.Parts] = []
     cores = sorted(os.sched_getaffinity(0))
     with tempfile.TemporaryDirectory(prefix="cellwatch-paper-") as scratch, _told("all of it"):
         folder = Path(scratch)
@@ -89,16 +89,16 @@ async def measure(amount: Amount) -> Found:
             seen = [views(*size, amount.frames) for size in amount.resolutions]
         write_cell(seen[0].cell, folder / "cell.yaml")
         async with Processes(folder / "logs", without=(MASTER_PREFIX,)) as processes:
-            site = await paper_master.start(processes, folder, folder / "cell.yaml")
+            site = await master.start(processes, folder, folder / "cell.yaml")
             site.pin({cores[-1]})
             os.sched_setaffinity(0, {cores[0]})
             try:
                 for each in seen:
                     with _told(f"{each.name}, composed and centralised"):
-                        bench = paper_composed.Bench(site, each, UNITS_COMPOSED, book)
+                        bench = composed.Bench(site, each, UNITS_COMPOSED, book)
                         parts += await bench.run(amount.sizes_m, amount.rounds, amount.octree_rounds)
                 with _told("all cameras with the same frames"):
-                    bench = paper_composed.Bench(site, seen[-1].of_one(0), UNITS_SAME_FRAMES, same)
+                    bench = composed.Bench(site, seen[-1].of_one(0), UNITS_SAME_FRAMES, same)
                     (same_parts,) = await bench.run((VOXEL_M,), amount.same_rounds, {})
             finally:
                 os.sched_setaffinity(0, cores)
@@ -108,10 +108,10 @@ async def measure(amount: Amount) -> Found:
     return Found(book, parts, same, same_parts)
 
 
-async def _run_units(site: paper_master.Site, seen: Sequence[Views], folder: Path, amount: Amount, book: Book) -> None:
-    with paper_running.running(site) as units:
+async def _run_units(site: master.Site, seen: Sequence[Views], folder: Path, amount: Amount, book: Book) -> None:
+    with running.running(site) as units:
         for each in seen:
-            bench = paper_running.Bench(site, units, each, folder, book)
+            bench = running.Bench(site, units, each, folder, book)
             await bench.run(amount.running_sizes_m, amount.running_rounds)
 
 

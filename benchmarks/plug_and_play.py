@@ -21,11 +21,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.fault_network import confine, run
-from benchmarks.fault_site import FaultError
-from benchmarks.plug_judge import Frames, Judge, first_voxel_s, pose_errors, true_pose
-from benchmarks.plug_network import Switch
-from benchmarks.plug_site import OTHER_HOST, TRACE, UNITS, PluggedUnit, PlugSite, pose_of
+from benchmarks.faulting.network import confine, run
+from benchmarks.faulting.site import FaultError
+from benchmarks.plugging.judge import Frames, Judge, first_voxel_s, pose_errors, true_pose
+from benchmarks.plugging.network import Switch
+from benchmarks.plugging.site import OTHER_HOST, TRACE, UNITS, PluggedUnit, PlugSite, pose_of
 from benchmarks.report import Mark, Result, line, write
 from edge_unit.config import ENVIRONMENT_PREFIX as UNIT_PREFIX
 from edge_unit.stance import BASELINE_LOOKS, PERIOD_S

@@ -27,8 +27,8 @@ from typing import Any
 
 import httpx
 
-from benchmarks.fault_network import run
-from benchmarks.machines import Machine, MachineError, confine, make_network, until, why_not
+from benchmarks.booting.machines import Machine, MachineError, confine, make_network, until, why_not
+from benchmarks.faulting.network import run
 from benchmarks.report import Mark, line, table, write
 from edge_unit.master_search import FILE_NAME
 from shared.clock import NS_PER_S, monotonic_ns

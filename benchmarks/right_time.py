@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from benchmarks.joint_delivery import Delivered, Delivery
 from benchmarks.report import RESULTS, Mark, Result, line, write
-from benchmarks.stage import reported_at
+from benchmarks.sweeping.stage import reported_at
 from benchmarks.sweeps import runner
 from edge_unit.delay_watch import LOOKS_MAX
 from edge_unit.joint_delay import DelayEstimate, DelayLook, estimate_delay

@@ -24,12 +24,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.map_readers import ASKING, BEGUN, LISTENING, Reading, read
+from benchmarks.loading.map_readers import ASKING, BEGUN, LISTENING, Reading, read
+from benchmarks.loading.merge_costs import MergeCost, merge_costs
+from benchmarks.loading.scale_load import ScalePlan, Step
+from benchmarks.loading.traffic import AGE_NS
 from benchmarks.master import POLL_S, READY_S
-from benchmarks.merge_costs import MergeCost, merge_costs
 from benchmarks.report import RESULTS, Curves, Mark, Result, line, write
-from benchmarks.scale_load import ScalePlan, Step
-from benchmarks.traffic import AGE_NS
 from master_server.registry import MAX_UNITS
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, UplinkError
@@ -132,7 +132,7 @@ class Bench:
             f"robot-{self._count}", "simulation.controller", "--url", url, "--token-file", operator
         )
         readers = await self._processes.start(
-            f"readers-{self._count}", "benchmarks.map_readers", url, operator, str(ASK_S), str(folder / "read")
+            f"readers-{self._count}", "benchmarks.loading.map_readers", url, operator, str(ASK_S), str(folder / "read")
         )
         await _until(folder / f"read{BEGUN}", readers)
         options = self._options
@@ -142,7 +142,7 @@ class Bench:
         )  # fmt: skip
         plan_file.write_text(json.dumps(asdict(plan)))
         load = await self._processes.start(
-            f"load-{self._count}", "benchmarks.scale_load", str(plan_file), str(result), may_end=True
+            f"load-{self._count}", "benchmarks.loading.scale_load", str(plan_file), str(result), may_end=True
         )
         code = await load.process.wait()
         readers.may_end = True
@@ -180,7 +180,7 @@ async def measure(options: argparse.Namespace) -> tuple[list[Row], str]:
             if refused is None:
                 return rows, ""
             beyond = tuple(count for count in options.units if count >= refused["units"])
-            wide, _ = await bench.run("benchmarks.wide_master", beyond)
+            wide, _ = await bench.run("benchmarks.loading.wide_master", beyond)
             return rows + wide, f"{refused['units']} units: {refused['refused']}"
 
 

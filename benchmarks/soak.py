@@ -24,13 +24,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.fault_network import confine, run
-from benchmarks.fault_site import START_S, FaultError
-from benchmarks.fault_watch import SETTLED_S
+from benchmarks.faulting.network import confine, run
+from benchmarks.faulting.site import START_S, FaultError
+from benchmarks.faulting.watch import SETTLED_S
 from benchmarks.report import RESULTS, Mark, Result, line, write
-from benchmarks.soak_schedule import Strike, schedule
-from benchmarks.soak_site import KINDS, SoakSite
-from benchmarks.soak_usage import (
+from benchmarks.soaking.schedule import Strike, schedule
+from benchmarks.soaking.site import KINDS, SoakSite
+from benchmarks.soaking.usage import (
     CALM_LOOKS,
     GROWTH_MIB_MAX,
     GROWTH_SHARE_MAX,

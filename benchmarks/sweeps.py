@@ -20,8 +20,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import quiet, shapes, thickness, walkers
 from benchmarks.report import RESULTS, Result, line, write
+from benchmarks.sweeping import quiet, shapes, thickness, walkers
 from shared.camera import Intrinsics
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.settings import FilterSettings

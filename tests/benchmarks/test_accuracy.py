@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks import accuracy, accuracy_real
-from benchmarks.accuracy_curves import AXES, METRICS, Collection, Curve, worse
-from benchmarks.accuracy_plan import BASELINES, OURS, POINTS
-from benchmarks.accuracy_rules import Measured, MinimumPoints, Ours, Paper, Place, algorithm_1, algorithm_6, before
-from benchmarks.accuracy_stage import THINGS, Stage
-from benchmarks.accuracy_trials import Entry
-from benchmarks.accuracy_truth import TOOL_M, Judge, Surface, Tally, visible_pixels_min
+from benchmarks import accuracy
+from benchmarks.judging import real
+from benchmarks.judging.curves import AXES, METRICS, Collection, Curve, worse
+from benchmarks.judging.plan import BASELINES, OURS, POINTS
+from benchmarks.judging.rules import Measured, MinimumPoints, Ours, Paper, Place, algorithm_1, algorithm_6, before
+from benchmarks.judging.stage import THINGS, Stage
+from benchmarks.judging.trials import Entry
+from benchmarks.judging.truth import TOOL_M, Judge, Surface, Tally, visible_pixels_min
 from benchmarks.plots import draw
 from edge_unit.pipeline import DepthPipeline
 from shared.lattice import Lattice
@@ -213,9 +214,9 @@ def test_a_quick_run_leaves_curves_that_explain_themselves(tmp_path: Path, capsy
 
 
 def test_real_frames_one_by_one(data_dir: Path) -> None:
-    judged = accuracy_real.watch(OURS, {POINTS: MinimumPoints()}, FilterSettings(), 0)
-    assert [mark.met for mark in accuracy_real.marks(judged, OURS)] == [True, True, True]
-    frames, distributions = accuracy_real.results(judged, OURS)
+    judged = real.watch(OURS, {POINTS: MinimumPoints()}, FilterSettings(), 0)
+    assert [mark.met for mark in real.marks(judged, OURS)] == [True, True, True]
+    frames, distributions = real.results(judged, OURS)
     mine = [row for row in frames.rows if row[0] == OURS]
     assert [row[1] for row in mine] == [0, 1, 2, 3]
     assert min(float(row[4]) for row in mine) >= 90

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.fault_scene import BOX_MIN_M, NEWCOMER, RESIDENTS
-from benchmarks.fault_watch import Answer, Present, Verdict, in_force, judge
+from benchmarks.faulting.scene import BOX_MIN_M, NEWCOMER, RESIDENTS
+from benchmarks.faulting.watch import Answer, Present, Verdict, in_force, judge
 from shared.clock import NS_PER_S
 
 CAUSE_NS, GONE_NS = 10 * NS_PER_S, 13 * NS_PER_S

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from benchmarks.latency import STAGES, TO_MERGED, WHOLE, Case, main, result, timed
-from benchmarks.latency_frames import RING_HZ, camera_phase_s, prepare
-from benchmarks.latency_unit import RingSource
-from benchmarks.map_readers import ASKING, LISTENING, Reading
+from benchmarks.loading.map_readers import ASKING, LISTENING, Reading
+from benchmarks.timing.frames import RING_HZ, camera_phase_s, prepare
+from benchmarks.timing.unit import RingSource
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from edge_unit.trace import TraceRecord
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns

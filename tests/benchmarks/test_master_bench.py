@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from benchmarks import master
-from benchmarks.load import Plan, carry_out, map_is_right
+from benchmarks.loading.load import Plan, carry_out, map_is_right
+from benchmarks.loading.traffic import SimpleUnit, View, captured_head, view
 from benchmarks.report import Mark
-from benchmarks.traffic import SimpleUnit, View, captured_head, view
 from edge_unit.client import MasterClient
 from shared.cell import Cell
 from shared.errors import MasterUnreachable

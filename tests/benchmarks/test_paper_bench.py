@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from benchmarks import paper
-from benchmarks.paper_book import ONE_PROCESS, UNITS_COMPOSED, Book, Key
-from benchmarks.paper_composed import Parts
-from benchmarks.paper_contenders import Centralised, IntoOctree, prepared
-from benchmarks.paper_scene import CAMERAS, Views, views, write_cell
-from benchmarks.paper_tables import (
+from benchmarks.repeating.book import ONE_PROCESS, UNITS_COMPOSED, Book, Key
+from benchmarks.repeating.composed import Parts
+from benchmarks.repeating.contenders import Centralised, IntoOctree, prepared
+from benchmarks.repeating.scene import CAMERAS, Views, views, write_cell
+from benchmarks.repeating.tables import (
     PAPER_FASTER_PERCENT,
     by_cameras,
     by_size,

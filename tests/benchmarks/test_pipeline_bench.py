@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import pipeline
 from benchmarks.pipeline import FRAMES_A_TURN, Spent, in_turns
-from benchmarks.ur3_scene import room
+from benchmarks.racing.ur3_scene import room
 from shared.transforms import look_at
 from simulation.camera import d435i_intrinsics
 
@@ -39,7 +39,7 @@ def test_the_first_frame_of_a_turn_is_told_apart() -> None:
 @pytest.mark.skipif(importlib.util.find_spec("dufomap") is None, reason="there is none for this processor")
 @needs_peers
 def test_dufomap_marks_the_space_before_what_it_is_given() -> None:
-    from benchmarks import peers
+    from benchmarks.racing import peers
 
     cell = room()
     camera = peers.Camera(d435i_intrinsics(424, 240), look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), cell)

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.map_readers import Reading
-from benchmarks.merge_costs import merge_costs
+from benchmarks.loading.map_readers import Reading
+from benchmarks.loading.merge_costs import merge_costs
+from benchmarks.loading.scale_load import Step
 from benchmarks.scale import Ages, Row, ages, cpu_fit, load_result, main
-from benchmarks.scale_load import Step
 from shared.clock import NS_PER_MS
 
 MS = NS_PER_MS

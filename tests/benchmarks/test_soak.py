@@ -12,12 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import soak_site
-from benchmarks.fault_scene import NEWCOMER, RESIDENTS
-from benchmarks.fault_watch import Answer
-from benchmarks.soak_schedule import HOLD_S, schedule
-from benchmarks.soak_site import GRACE_NS, KINDS, Scene
-from benchmarks.soak_usage import CALM_LOOKS, Lifetime, Sample
+from benchmarks.faulting.scene import NEWCOMER, RESIDENTS
+from benchmarks.faulting.watch import Answer
+from benchmarks.soaking.schedule import HOLD_S, schedule
+from benchmarks.soaking.site import GRACE_NS, KINDS, Scene
+from benchmarks.soaking.usage import CALM_LOOKS, Lifetime, Sample
 from shared.clock import NS_PER_S
 
 FIRST, SECOND = (thing.name for thing in RESIDENTS)
@@ -83,7 +82,7 @@ def answer(now_ns: int, complete: bool, held: set[str], free: tuple[str, ...] = 
 def test_answers_are_held_against_what_stood_there(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, both = Scene(), {FIRST, SECOND}
     came_ns = 100 * NS_PER_S
-    monkeypatch.setattr(soak_site, "monotonic_ns", lambda: came_ns)
+    monkeypatch.setattr(site, "monotonic_ns", lambda: came_ns)
     scene.change((*both, NEWCOMER.name))
     before_ns, soon_ns, later_ns = came_ns - 1, came_ns + GRACE_NS // 2, came_ns + 2 * GRACE_NS
     # Nobody can know at once that somebody came.
@@ -96,7 +95,7 @@ def test_answers_are_held_against_what_stood_there(monkeypatch: pytest.MonkeyPat
     assert "which is not there" in scene.wrong(answer(before_ns, True, both | {NEWCOMER.name}))
     assert not scene.wrong(answer(later_ns, False, set()))
     goes_ns = came_ns + 10 * NS_PER_S
-    monkeypatch.setattr(soak_site, "monotonic_ns", lambda: goes_ns)
+    monkeypatch.setattr(site, "monotonic_ns", lambda: goes_ns)
     scene.change(both, (NEWCOMER.name,))
     assert not scene.wrong(answer(goes_ns + 2 * GRACE_NS, True, both))
     assert not scene.wrong(answer(goes_ns + 2 * GRACE_NS, True, both | {NEWCOMER.name}))

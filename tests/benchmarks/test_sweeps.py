@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from benchmarks import shapes, sweeps
+from benchmarks import sweeps
 from benchmarks.report import Mark, Result
-from benchmarks.stage import Stage, reported_at
+from benchmarks.sweeping import shapes
+from benchmarks.sweeping.stage import Stage, reported_at
 from benchmarks.sweeps import Amount, quick
 from shared.meshes import box_mesh
 from shared.settings import FilterSettings

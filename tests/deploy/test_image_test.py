@@ -14,10 +14,10 @@ import httpx
 import pytest
 
 from benchmarks import image_test
-from benchmarks.emulated import Board
-from benchmarks.image_parts import KERNEL_FILES, forget_all_but_newest, state_of_kernels
+from benchmarks.booting.emulated import Board
+from benchmarks.booting.image_parts import KERNEL_FILES, forget_all_but_newest, state_of_kernels
+from benchmarks.booting.machines import MachineError
 from benchmarks.image_test import Watch, main, why_not
-from benchmarks.machines import MachineError
 from edge_unit.config import ENVIRONMENT_PREFIX, UnitConfig
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from shared.configuration import load

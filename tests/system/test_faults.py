@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.fault_watch import NOTICED_S_MAX, RECOVERED_S_MAX
+from benchmarks.faulting.watch import NOTICED_S_MAX, RECOVERED_S_MAX
 from benchmarks.faults import FAULTS
 from tests.missing import need_namespaces
 

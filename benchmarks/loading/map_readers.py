@@ -2,8 +2,8 @@
 """Two robots that read the map: one asks for it, one listens to the stream, and both note when they had it.
 
 `python -m benchmarks.loading.map_readers URL TOKEN_FILE ASK_S RESULT` reads until told to stop, then leaves all that it
-noted in RESULT (JSON): a list of `Reading` by reader. It runs on the master's machine, whose clock is its own. A file RESULT
-with the suffix BEGUN is there as soon as both have had a map.
+noted in RESULT (JSON): a list of `Reading` by reader. It runs on the master's machine, whose clock is its own. A file
+RESULT with the suffix BEGUN is there as soon as both have had a map.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """More and more units before one master, from a process of its own.
 
-`python -m benchmarks.loading.scale_load PLAN RESULT` carries out the `ScalePlan` in one file, and adds a line of JSON to
-the other for each step: `Step`, or `{"units", "refused"}` where the master takes no more. Which frame the master had merged
-when goes to RESULT with the suffix `.UNITS-RATE.npz`.
+`python -m benchmarks.loading.scale_load PLAN RESULT` carries out the `ScalePlan` in one file, and adds a line of JSON
+to the other for each step: `Step`, or `{"units", "refused"}` where the master takes no more. Which frame the master had
+merged when goes to RESULT with the suffix `.UNITS-RATE.npz`.
 """
 
 from __future__ import annotations

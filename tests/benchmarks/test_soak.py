@@ -14,6 +14,7 @@ import pytest
 
 from benchmarks.faulting.scene import NEWCOMER, RESIDENTS
 from benchmarks.faulting.watch import Answer
+from benchmarks.soaking import site
 from benchmarks.soaking.schedule import HOLD_S, schedule
 from benchmarks.soaking.site import GRACE_NS, KINDS, Scene
 from benchmarks.soaking.usage import CALM_LOOKS, Lifetime, Sample

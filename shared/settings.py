@@ -54,7 +54,7 @@ class FilterSettings(BaseModel):
         default=0.03, ge=0.0, le=0.5, description="Constant part of the margin before CAD surfaces, in metres."
     )
     margin_noise_gain: float = Field(
-        default=4.25, ge=0.0, le=20.0, description="Standard deviations of stereo noise in the margin before CAD."
+        default=4.75, ge=0.0, le=20.0, description="Standard deviations of stereo noise in the margin before CAD."
     )
     stereo_subpixel_px: float = Field(
         default=0.12, ge=0.01, le=1.0, description="Standard deviation of the camera's disparity, in pixels."

@@ -84,6 +84,7 @@ PARTS = (
     Part("source_faults", "source-faults", "Cameras that fail", "How soon is it told, and when do frames flow again?"),
     Part("plug_and_play", "plug-and-play", "Power on and forget", "How long until units that know nothing are live?"),
     Part("rehearsal", "rehearsal", "Machines that boot", "How long from power-on to the first voxel?"),
+    Part("image_test", "image-test", "One image, two arm64 boards", "Do they boot, differ and report, and how soon?"),
     Part("viewer", "viewer-test", "The operator's window", "What do those who look cost the units?"),
 )
 """In the order of the report. Those with a limit are what `make bench` runs."""

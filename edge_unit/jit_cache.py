@@ -7,6 +7,9 @@ without a home of its own would not even start. A folder that was filled before 
 It compiles a kernel anew when the kernel's own file has changed, and not when that of a kernel or a constant has which
 it uses. So each state of all the kernels has a folder of its own. Kernels that came with the release are found in it,
 where they fit (`carried_kernels`); otherwise they are compiled for this very processor.
+
+It waits for no disk when it writes, and takes what it finds for whole: after a power cut it would raise at each start.
+So files that are empty or cut short are taken out, and compiled anew.
 """
 
 from __future__ import annotations
@@ -14,11 +17,13 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import pickletools
 import shutil
 import stat
 import sys
 import tempfile
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 
 from edge_unit.carried_kernels import PREFIX, Target, carried, link
@@ -96,8 +101,33 @@ def _use(parent: Path) -> Path:
         states = sorted(parent.glob(f"{PREFIX}*"), key=lambda path: path.stat().st_mtime)
         for old in states[:-STATES_MAX]:
             shutil.rmtree(old, ignore_errors=True)
+    _take_out_damaged(folder)
     _tell_numba(folder)
     return folder
+
+
+def _take_out_damaged(folder: Path) -> None:
+    for file in folder.glob("*/*.nb[ic]"):
+        try:
+            if not _is_whole(file.read_bytes()):
+                logger.warning("%s: damaged, its kernel is compiled anew", file)
+                file.unlink(missing_ok=True)
+        except OSError as error:
+            logger.warning("%s: a compiled kernel cannot be read: %s", file, error)
+
+
+def _is_whole(content: bytes) -> bool:
+    """Whether it is one pickle after another to its end; none of them is loaded."""
+    stream = BytesIO(content)
+    try:
+        for _ in pickletools.genops(stream):
+            pass
+        while stream.tell() < len(content):
+            for _ in pickletools.genops(stream):
+                pass
+    except (ValueError, OverflowError):
+        return False
+    return True
 
 
 def _tell_numba(folder: Path) -> None:

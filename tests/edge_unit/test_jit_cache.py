@@ -130,3 +130,26 @@ def test_each_state_of_the_kernels_has_a_folder_of_its_own(tmp_path: Path, monke
         os.utime(folders[-1], (state, state))
     assert len(set(folders)) == len(folders)
     assert sorted((tmp_path / "cache").iterdir()) == sorted(folders[-jit_cache.STATES_MAX :])
+
+
+DAMAGE = {
+    "emptied": lambda content: b"",
+    "cut": lambda content: content[: len(content) * 2 // 3],
+    "zeros": lambda content: bytes(len(content)),
+    "something else": lambda content: b"<html>" + content,
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+def test_a_kernel_that_a_power_cut_damaged_is_compiled_anew(tmp_path: Path, kind: str, damage: str) -> None:
+    folder, logged = compile_with(tmp_path, str(tmp_path / "cache"))
+    assert logged == ""
+    (file,) = Path(folder).glob(f"*/*.{kind}")
+    whole = file.read_bytes()
+    file.write_bytes(DAMAGE[damage](whole))
+    found, logged = compile_with(tmp_path, str(tmp_path / "cache"))
+    assert found == folder
+    assert logged == f"{file}: damaged, its kernel is compiled anew"
+    assert len(file.read_bytes()) > len(whole) // 2
+    assert compile_with(tmp_path, str(tmp_path / "cache")) == (folder, "")

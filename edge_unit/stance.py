@@ -244,8 +244,10 @@ class Stance:
         slope, curvature = (np.array(document[name], np.float64) for name in ("slope", "curvature"))
         if slope.shape != (6,) or curvature.shape != (6,):
             raise ValueError("expected six axes")
-        shares = float(document["valid_share"]), float(document["beyond_share"])
-        return _Fit(int(document["looks"]), slope, curvature, *shares)
+        looks, *shares = (float(document[name]) for name in ("looks", "valid_share", "beyond_share"))
+        if not np.isfinite([*slope, *curvature, looks, *shares]).all():
+            raise ValueError("expected finite numbers")
+        return _Fit(int(looks), slope, curvature, *shares)
 
     def _document(self, fit: _Fit) -> dict[str, Any]:
         return {

@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 STATE_MAX_BYTES = 10_000
 """Some ten times the longest document that is kept as state; what is longer is none of ours."""
 
-UNREADABLE = (OSError, ValueError, KeyError, TypeError, RecursionError)
+UNREADABLE = (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError)
 """What reading and parsing a damaged document raises."""
 
 
@@ -77,7 +77,7 @@ class StateFile:
     def load(self, parse: Callable[[Any], Parsed]) -> Parsed | None:
         """What `parse` makes of the document, or None when there is none; a damaged one is as good as none.
 
-        `parse` raises ValueError, KeyError or TypeError where the document is none of ours.
+        `parse` raises ValueError, KeyError, TypeError or OverflowError where the document is none of ours.
         """
         try:
             if self._path.stat().st_size > STATE_MAX_BYTES:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -119,6 +120,18 @@ def test_a_pose_that_was_wrong_from_the_beginning_is_a_warning(tmp_path: Path) -
     verdict = watched.last(BASELINE_LOOKS + WINDOW, off)
     assert "degrees off" in verdict.warning or "mm off" in verdict.warning
     assert not verdict.reason
+
+
+@pytest.mark.parametrize("number", ["NaN", "1e999", "1" + "0" * 400])
+@pytest.mark.parametrize("name", ["looks", "slope", "curvature", "valid_share", "beyond_share"])
+def test_a_fit_that_is_no_number_is_passed_over(watched: Watched, name: str, number: str) -> None:
+    file = watched.folder / FILE_NAME
+    document = json.loads(file.read_text())
+    document[name] = [0.5] * 6 if name in ("slope", "curvature") else 0.5
+    file.write_text(json.dumps(document).replace("0.5", number))
+    watched.restart()
+    assert watched.stance._usual is None
+    assert set(watched.looks(BASELINE_LOOKS)) == {Verdict()}
 
 
 @pytest.mark.parametrize("text", ["", "{}", '{"place": 1', "[]", "x" * 20_000])

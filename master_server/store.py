@@ -349,6 +349,8 @@ def _check(connection: sqlite3.Connection, path: Path) -> None:
     if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
         raise _damaged(path, "it is no store of a master")
     version = connection.execute("PRAGMA user_version").fetchone()[0]
+    if version < min(UPGRADES):
+        raise _damaged(path, f"a store of version {version}, which never was")
     if version > SCHEMA_VERSION:
         raise ConfigError(
             f"{path}: expected a store of version {SCHEMA_VERSION}, got version {version}: it was written by a newer "

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 DensityModel = Literal["pinhole", "angular"]
 DensityRule = Literal["neighbourhood", "single"]
@@ -96,6 +96,14 @@ class FilterSettings(BaseModel):
     seen_share_min: float = Field(
         default=0.9, ge=0.5, le=1.0, description="Share of a block's rays that must pass through it to call it seen."
     )
+
+    @field_validator("range_max_m")
+    @classmethod
+    def _beyond_the_least(cls, range_max_m: float, info: ValidationInfo) -> float:
+        # Between them nothing would be measured: every unit would be live, with an empty view.
+        if range_max_m <= (range_min_m := info.data.get("range_min_m", 0.0)):
+            raise ValueError(f"expected more than range_min_m, {range_min_m:g}")
+        return range_max_m
 
 
 class Settings(FilterSettings):

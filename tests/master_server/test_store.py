@@ -194,6 +194,26 @@ def test_settings_of_another_version_that_do_not_fit_are_told_and_left_out(
     assert "of_tomorrow, voxel_size_m as stored do not fit" in caplog.text
 
 
+def test_stored_ranges_between_which_nothing_is_are_left_out(store: Store, caplog: pytest.LogCaptureFixture) -> None:
+    Master(cell(), Settings(), store).change_settings({"occupancy_threshold": 0.7})
+    store._connection.execute(
+        "UPDATE facts SET value = json_set(value, '$.range_min_m', 5, '$.range_max_m', 0.5) WHERE name = 'settings'"
+    )
+    settings = begin_again(store, cell(), caplog).settings
+    assert (settings.range_min_m, settings.range_max_m, settings.occupancy_threshold) == (5.0, 10.0, 0.7)
+    assert "range_max_m as stored do not fit" in caplog.text
+
+
+def test_a_range_in_which_nothing_is_measured_is_refused(store: Store) -> None:
+    master = Master(cell(), Settings(), store)
+    master.change_settings({"range_max_m": 2.0})
+    for changes in ({"range_min_m": 2.0}, {"range_min_m": 5.0, "range_max_m": 0.5}):
+        with pytest.raises(Refusal, match="range_max_m: value error, expected more than range_min_m") as refused:
+            master.change_settings(changes)
+        assert refused.value.status == 422
+    assert (master.settings.range_min_m, master.settings.range_max_m) == (0.0, 2.0)
+
+
 # ---------------------------------------------------------------------- files
 
 
@@ -218,6 +238,16 @@ def test_a_store_of_a_newer_master_is_refused(path: Path) -> None:
     newer.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 1}")
     newer.close()
     with pytest.raises(ConfigError, match="newer"):
+        Store.open(path)
+
+
+@pytest.mark.parametrize("version", [0, -3])
+def test_a_store_of_a_version_that_never_was_is_refused(path: Path, version: int) -> None:
+    Store.open(path).close()
+    other = sqlite3.connect(path)
+    other.execute(f"PRAGMA user_version = {version}")
+    other.close()
+    with pytest.raises(ConfigError, match=f"a store of version {version}, which never was"):
         Store.open(path)
 
 

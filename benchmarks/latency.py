@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -35,7 +34,8 @@ from edge_unit.trace import TraceRecord, read_trace
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, UplinkError
 from simulation.fleet import FIRST_ADDRESS, MASTER_PREFIX
-from simulation.processes import Child, Processes
+from simulation.processes import Child, Processes, until_written
+from simulation.running_master import start_master
 from simulation.world import DEMO_CELL
 
 UNITS = 4
@@ -150,20 +150,18 @@ class Bench:
         """One case from the first process to the last.
 
         Raises:
-            UplinkError: something did not start, or ended before its time.
+            CellwatchError: something did not start, or ended before its time.
         """
         self._count += 1
         folder = self._folder / str(self._count)
         folder.mkdir()
-        ready_file, result = folder / "ready.json", folder / "read"
-        master = await self._start(
-            "master", "master_server",
-            *("--cell", str(DEMO_CELL), "--host", "127.0.0.1", "--port", "0", "--public-reads"),
-            *("--state-dir", str(folder / "master"), "--ready-file", str(ready_file), "--log-level", "WARNING"),
+        result = folder / "read"
+        running = await start_master(
+            self._processes, DEMO_CELL, folder / "master", "--public-reads", "--log-level", "WARNING",
+            name=f"{self._count}-master", ready_s=START_S,
         )  # fmt: skip
-        await _until(ready_file.exists, master)
-        ready = json.loads(ready_file.read_text())
-        url, operator, epoch_ns = ready["url"], ready["operator_token_file"], monotonic_ns()
+        master, url, operator = running.child, running.url, str(running.operator_token_file)
+        epoch_ns = monotonic_ns()
         robot = await self._start(
             "robot", "simulation.controller",
             *("--url", url, "--token-file", operator, "--epoch-ns", str(epoch_ns)),
@@ -181,7 +179,7 @@ class Bench:
             document = {
                 "source": source.model_dump(mode="json"),
                 "master_url": url,
-                "token_file": ready["unit_token_file"],
+                "token_file": str(running.unit_token_file),
                 "state_dir": str(state),
                 "source_address": str(FIRST_ADDRESS + camera),
                 "trace_path": str(traces[-1]),
@@ -192,7 +190,7 @@ class Bench:
         await self._all_live(url, (master, robot, *units))
         await asyncio.sleep(SETTLE_S)
         readers = await self._start("readers", "benchmarks.loading.map_readers", url, operator, str(ASK_S), str(result))
-        await _until(result.with_suffix(BEGUN).exists, readers)
+        await until_written(readers, result.with_suffix(BEGUN), START_S)
         began_ns = monotonic_ns()
         await asyncio.sleep(self._seconds + TAIL_S)
         end_ns = monotonic_ns() - round(TAIL_S * NS_PER_S)
@@ -218,23 +216,12 @@ class Bench:
                 rows = (await client.get("/units")).raise_for_status().json()
                 if len(rows) == UNITS and all(row["state"] == "live" for row in rows):
                     return
-                _check(children, deadline_ns, f"{[(row['ip'], row['state'], row['reason']) for row in rows]}")
+                if ended := next((child for child in children if child.ended), None):
+                    raise UplinkError(f"{ended.name}: {ended.ended}; {ended.log_tail()}")
+                if monotonic_ns() > deadline_ns:
+                    told = [(row["ip"], row["state"], row["reason"]) for row in rows]
+                    raise UplinkError(f"not ready within {START_S:g} s: {told}")
                 await asyncio.sleep(POLL_S)
-
-
-async def _until(holds: Callable[[], bool], child: Child) -> None:
-    deadline_ns = monotonic_ns() + round(START_S * NS_PER_S)
-    while not holds():
-        _check((child,), deadline_ns, child.name)
-        await asyncio.sleep(POLL_S)
-
-
-def _check(children: Sequence[Child], deadline_ns: int, what: str) -> None:
-    for child in children:
-        if child.ended:
-            raise UplinkError(f"{child.name}: {child.ended}; {child.log_tail()}")
-    if monotonic_ns() > deadline_ns:
-        raise UplinkError(f"not ready within {START_S:g} s: {what}")
 
 
 async def measure(

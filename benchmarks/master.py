@@ -21,10 +21,10 @@ from typing import Any
 
 from benchmarks.loading.load import FRAME_RATE_HZ, Plan
 from benchmarks.report import RESULTS, Mark, Result, line, write
-from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, UplinkError
 from simulation.fleet import MASTER_PREFIX
-from simulation.processes import Child, Processes
+from simulation.processes import Child, Processes, until_written
+from simulation.running_master import READY_S, RunningMaster, start_master
 from simulation.world import DEMO_CELL
 
 UNITS = (1, 4, 10, 50)
@@ -38,11 +38,6 @@ MOST_UNITS, MOST_VOXELS = 50, 1000
 
 P99_MS, MOST_PER_S = 6.0, 4000.0
 BYTES_A_VOXEL, BYTES_BESIDE = 4, 800
-
-READY_S = 30.0
-"""For a process to be there on a busy machine."""
-
-POLL_S = 0.02
 
 
 class Bench:
@@ -91,24 +86,24 @@ class Bench:
         self, units: int, voxels: int, rate_hz: float | None, bare: bool, seconds: float, viewers: int = 0
     ) -> dict[str, Any]:
         os.sched_setaffinity(0, {self._server_core})
-        server, ready = await self._server(bare)
+        master = None if bare else await start_master(self._processes, DEMO_CELL, self._folder / "state")
+        server, url, pid = await self._bare() if master is None else (master.child, master.url, master.pid)
         os.sched_setaffinity(0, {self._load_core})
         children = [server]
-        if not bare:
+        if master is not None:
             children.append(
                 await self._processes.start(
                     "controller",
                     "simulation.controller",
-                    *("--url", ready["url"], "--token-file", ready["operator_token_file"]),
+                    *("--url", url, "--token-file", str(master.operator_token_file)),
                 )
             )
-        if viewers:
-            children.append(await self._watchers(ready, viewers))
+            if viewers:
+                children.append(await self._watchers(master, viewers))
         token_file = self._folder / "token"
-        token_file.write_text("no token is asked for here" if bare else Path(ready["unit_token_file"]).read_text())
+        token_file.write_text("no token is asked for here" if master is None else master.unit_token)
         plan = Plan(
-            ready["url"], str(token_file), str(DEMO_CELL), units, voxels, seconds, WARM_UP_S, rate_hz,
-            ready["pid"], bare,
+            url, str(token_file), str(DEMO_CELL), units, voxels, seconds, WARM_UP_S, rate_hz, pid, bare
         )  # fmt: skip
         result = self._folder / "result.json"
         result.unlink(missing_ok=True)
@@ -125,43 +120,25 @@ class Bench:
         found: dict[str, Any] = json.loads(result.read_text())
         return found
 
-    async def _watchers(self, ready: dict[str, Any], viewers: int) -> Child:
+    async def _watchers(self, master: RunningMaster, viewers: int) -> Child:
         """So many who look at the master's viewer, once all of them see something."""
         seeing = self._folder / "seeing"
         seeing.unlink(missing_ok=True)
         watchers = await self._processes.start(
             "watchers",
             "benchmarks.loading.watchers",
-            *(ready["url"], ready["operator_token_file"], str(ready["pid"]), str(viewers), str(seeing)),
+            *(master.url, str(master.operator_token_file), str(master.pid), str(viewers), str(seeing)),
         )
-        deadline_ns = monotonic_ns() + round(READY_S * NS_PER_S)
-        while not seeing.exists():
-            if watchers.ended or monotonic_ns() > deadline_ns:
-                raise UplinkError(f"{watchers.name} do not see anything; {watchers.log_tail()}")
-            await asyncio.sleep(POLL_S)
+        await until_written(watchers, seeing, READY_S)
         return watchers
 
-    async def _server(self, bare: bool) -> tuple[Child, dict[str, Any]]:
-        ready_file = self._folder / "ready.json"
+    async def _bare(self) -> tuple[Child, str, int]:
+        """The bare route, its URL and the number of its process."""
+        ready_file = self._folder / "bare.json"
         ready_file.unlink(missing_ok=True)
-        if bare:
-            server = await self._processes.start(
-                "bare", "benchmarks.loading.bare_fastapi", "--ready-file", str(ready_file)
-            )
-        else:
-            server = await self._processes.start(
-                "master",
-                "master_server",
-                *("--cell", str(DEMO_CELL), "--host", "127.0.0.1", "--port", "0"),
-                *("--state-dir", str(self._folder / "state"), "--ready-file", str(ready_file)),
-            )
-        deadline_ns = monotonic_ns() + round(READY_S * NS_PER_S)
-        while not ready_file.exists():
-            if server.ended or monotonic_ns() > deadline_ns:
-                raise UplinkError(f"{server.name} did not start; {server.log_tail()}")
-            await asyncio.sleep(POLL_S)
-        ready: dict[str, Any] = json.loads(ready_file.read_text())
-        return server, ready
+        server = await self._processes.start("bare", "benchmarks.loading.bare_fastapi", "--ready-file", str(ready_file))
+        ready = json.loads(await until_written(server, ready_file, READY_S))
+        return server, ready["url"], ready["pid"]
 
 
 async def measure(units: Sequence[int], voxels: Sequence[int], seconds: float, turns: int) -> dict[str, Any]:

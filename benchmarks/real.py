@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -37,7 +36,9 @@ from edge_unit.trace import read_trace
 from master_server.config import ENVIRONMENT_PREFIX as MASTER_PREFIX
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, SourceError
+from shared.waiting import within
 from simulation.processes import Child, Processes
+from simulation.running_master import RunningMaster, start_master
 
 READY_S = 60.0
 """For a process to come up and compile its kernels on a slow machine."""
@@ -113,11 +114,14 @@ async def play(folder: Path, source: SourceConfig) -> dict[int, SeenMap]:
     with tempfile.TemporaryDirectory(prefix="cellwatch-real-") as scratch:
         state = Path(scratch)
         async with Processes(state / "logs", without=(UNIT_PREFIX, MASTER_PREFIX)) as processes:
-            ready = await _start_master(processes, state)
-            unit = await _start_unit(processes, state, ready, folder, source)
-            async with httpx.AsyncClient(base_url=ready["url"], headers=_operator(ready)) as client:
+            master = await start_master(
+                processes, real_frames.CELL, state / "master", "--set", "settings.stale_after_s=5.0", ready_s=READY_S
+            )
+            unit = await _start_unit(processes, state, master, folder, source)
+            async with httpx.AsyncClient(base_url=master.url, headers=master.as_operator) as client:
                 if isinstance(source, RealsenseSourceConfig):
-                    await asyncio.wait_for(unit.process.wait(), READY_S)
+                    if not await within(READY_S, unit.process.wait()):
+                        raise SourceError(f"the unit did not play the recording to its end; {unit.log_tail()}")
                     last = WATCHED_FRAMES[-1]
                     maps = {last: SeenMap(await _voxels(client), 0.0)}
                 else:
@@ -247,31 +251,13 @@ async def _row(client: httpx.AsyncClient) -> dict[str, Any] | None:
     return rows[0] if rows else None
 
 
-async def _start_master(processes: Processes, state: Path) -> dict[str, Any]:
-    """A real master at a free port; returns what it says when it is ready."""
-    ready_file = state / "ready.json"
-    master = await processes.start(
-        "master",
-        "master_server",
-        *("--cell", str(real_frames.CELL), "--host", "127.0.0.1", "--port", "0"),
-        *("--state-dir", str(state / "master"), "--ready-file", str(ready_file), "--set", "settings.stale_after_s=5.0"),
-    )
-    deadline_ns = monotonic_ns() + round(READY_S * NS_PER_S)
-    while not ready_file.exists():
-        if master.ended or monotonic_ns() > deadline_ns:
-            raise SourceError(f"the master did not start; {master.log_tail()}")
-        await asyncio.sleep(POLL_S)
-    ready: dict[str, Any] = json.loads(ready_file.read_text())
-    return ready
-
-
 async def _start_unit(
-    processes: Processes, state: Path, ready: dict[str, Any], folder: Path, source: SourceConfig
+    processes: Processes, state: Path, master: RunningMaster, folder: Path, source: SourceConfig
 ) -> Child:
     """A real unit that learns from the first frames and watches the rest."""
     config = {
-        "master_url": ready["url"],
-        "token_file": ready["unit_token_file"],
+        "master_url": master.url,
+        "token_file": str(master.unit_token_file),
         "state_dir": str(state / "unit"),
         "source": source.model_dump(mode="json"),
         "T_world_camera": {"file": str(folder / "T_base_optical.txt")},
@@ -287,11 +273,6 @@ def _images(folder: Path) -> RecordedSourceConfig:
     return RecordedSourceConfig(
         folder=folder, frames=tuple(ORDER), fps=1.0 / FRAME_S, fx_stereo=real_frames.STEREO_FOCAL_PX
     )
-
-
-def _operator(ready: dict[str, Any]) -> dict[str, str]:
-    token = Path(ready["operator_token_file"]).read_text().strip()
-    return {"Authorization": f"Bearer {token}"}
 
 
 def _parser() -> argparse.ArgumentParser:

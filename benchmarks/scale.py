@@ -28,14 +28,14 @@ from benchmarks.loading.map_readers import ASKING, BEGUN, LISTENING, Reading, re
 from benchmarks.loading.merge_costs import MergeCost, merge_costs
 from benchmarks.loading.scale_load import ScalePlan, Step
 from benchmarks.loading.traffic import AGE_NS
-from benchmarks.master import POLL_S, READY_S
 from benchmarks.report import RESULTS, Curves, Mark, Result, line, write
 from master_server.registry import MAX_UNITS
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, UplinkError
 from shared.settings import Settings
 from simulation.fleet import MASTER_PREFIX
-from simulation.processes import Child, Processes
+from simulation.processes import Processes, until_written
+from simulation.running_master import READY_S, start_master
 from simulation.world import DEMO_CELL
 
 UNITS = (1, 2, 4, 8, 16, 32, 50, 64, 100, 200)
@@ -112,33 +112,29 @@ class Bench:
         """Steps before a new master, up to where it refuses; and what it refused.
 
         Raises:
-            UplinkError: something ended before its time.
+            CellwatchError: something did not start, or ended before its time.
         """
         self._count += 1
         folder = self._folder / str(self._count)
         folder.mkdir()
-        ready_file, plan_file, result = folder / "ready.json", folder / "plan.json", folder / "steps"
+        plan_file, result = folder / "plan.json", folder / "steps"
         os.sched_setaffinity(0, {self._server_core})
-        server = await self._processes.start(
-            f"master-{self._count}", module,
-            *("--cell", str(DEMO_CELL), "--host", "127.0.0.1", "--port", "0"),
-            *("--state-dir", str(folder / "state"), "--ready-file", str(ready_file)),
-        )  # fmt: skip
-        await _until(ready_file, server)
+        master = await start_master(
+            self._processes, DEMO_CELL, folder / "state", name=f"master-{self._count}", module=module
+        )
         os.sched_setaffinity(0, {self._load_core})
-        ready = json.loads(ready_file.read_text())
-        url, operator = ready["url"], ready["operator_token_file"]
+        url, operator = master.url, str(master.operator_token_file)
         robot = await self._processes.start(
             f"robot-{self._count}", "simulation.controller", "--url", url, "--token-file", operator
         )
         readers = await self._processes.start(
             f"readers-{self._count}", "benchmarks.loading.map_readers", url, operator, str(ASK_S), str(folder / "read")
         )
-        await _until(folder / f"read{BEGUN}", readers)
+        await until_written(readers, folder / f"read{BEGUN}", READY_S)
         options = self._options
         plan = ScalePlan(
-            url, ready["unit_token_file"], str(DEMO_CELL), units, options.rates, options.voxels, options.seconds,
-            WARM_UP_S, ready["pid"],
+            url, str(master.unit_token_file), str(DEMO_CELL), units, options.rates, options.voxels, options.seconds,
+            WARM_UP_S, master.pid,
         )  # fmt: skip
         plan_file.write_text(json.dumps(asdict(plan)))
         load = await self._processes.start(
@@ -148,10 +144,10 @@ class Bench:
         readers.may_end = True
         readers.process.terminate()
         await readers.process.wait()
-        failed = [child for child in (server, robot) if child.failed] + ([load] if code else [])
+        failed = [child for child in (master.child, robot) if child.failed] + ([load] if code else [])
         if failed:
             raise UplinkError(f"{failed[0].name} failed: {failed[0].ended}; {failed[0].log_tail()}")
-        await self._processes.stop(server, robot)
+        await self._processes.stop(master.child, robot)
         found = [json.loads(text) for text in result.read_text().splitlines()]
         readings = read(folder / "read")
         rows = []
@@ -160,14 +156,6 @@ class Bench:
             asked, streamed = (ages(merged, readings[name], step.begin_ns, step.end_ns) for name in (ASKING, LISTENING))
             rows.append(Row(step, asked, streamed, module != "master_server"))
         return rows, next((fields for fields in found if "refused" in fields), None)
-
-
-async def _until(path: Path, child: Child) -> None:
-    deadline_ns = monotonic_ns() + round(READY_S * NS_PER_S)
-    while not path.exists():
-        if child.ended or monotonic_ns() > deadline_ns:
-            raise UplinkError(f"{child.name} did not start; {child.log_tail()}")
-        await asyncio.sleep(POLL_S)
 
 
 async def measure(options: argparse.Namespace) -> tuple[list[Row], str]:

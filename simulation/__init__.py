@@ -19,6 +19,7 @@ and tests need no clock. In the order of the flow:
     warm_up      compiles what a simulated unit needs, once for many
     evaluation   what units reported, held against what was there
     processes    child processes that never outlive their parent
+    running_master a real master as such a process
     power        the switch at the units, for whoever watches
     fleet        a master, its units and the controller as real processes
     table        the demo's live table

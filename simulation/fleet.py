@@ -7,12 +7,10 @@ Every unit connects from an IP address of its own: 127.0.0.2, .3 ... (all of 127
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv4Address
 from pathlib import Path
-from typing import Any
 
 import httpx
 import yaml
@@ -20,9 +18,10 @@ import yaml
 from edge_unit.config import ENVIRONMENT_PREFIX as UNIT_PREFIX
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from shared.clock import monotonic_ns
-from shared.errors import ConfigError, MasterUnreachable
+from shared.errors import ConfigError
 from simulation.evaluation import UnitRun
 from simulation.processes import Child, Processes
+from simulation.running_master import RunningMaster, start_master
 from simulation.world import DEMO_CELL
 
 MASTER_PREFIX = "CELLWATCH_MASTER_"
@@ -34,8 +33,8 @@ FIRST_ADDRESS = IPv4Address("127.0.0.2")
 QUIET_S = 5.0
 """Warming up takes less than this when all is compiled, unless the machine is very busy."""
 
-POLL_S = 0.02
-"""Between looks at whether the master is up."""
+START_S = 240.0
+"""For the master to be there on a slow machine with much else to do."""
 
 LOG_LEVEL = ("--log-level", "WARNING")
 
@@ -77,6 +76,7 @@ class Fleet:
     units: list[FleetUnit] = field(init=False, default_factory=list)
     master: Child = field(init=False)
     url: str = field(init=False)
+    _running: RunningMaster = field(init=False)
 
     def __post_init__(self) -> None:
         # What the environment says of real units and masters does not hold here.
@@ -86,31 +86,22 @@ class Fleet:
         """Start it and wait until it can be asked; `actions` of an operator on a unit are offered by its viewer.
 
         Raises:
-            MasterUnreachable: it ended before.
+            MasterUnreachable: it ended before, or did not come in time.
         """
-        ready_file = self.folder / "master.json"
-        options = self.options
-        self.master = await self.processes.start(
-            "master",
-            "master_server",
-            *("--cell", str(DEMO_CELL), "--host", "127.0.0.1", "--port", str(options.port), "--public-reads"),
-            *("--state-dir", str(self.folder / "master"), "--ready-file", str(ready_file)),
-            *("--set", f"settings.voxel_size_m={options.voxel_size_m}", *LOG_LEVEL),
+        self._running = await start_master(
+            self.processes,
+            DEMO_CELL,
+            self.folder / "master",
+            *("--public-reads", "--set", f"settings.voxel_size_m={self.options.voxel_size_m}", *LOG_LEVEL),
             *(part for name, url in (actions or {}).items() for part in ("--set", f"unit_actions.{name}={url}")),
+            port=self.options.port,
+            ready_s=START_S,
         )
-        while not ready_file.exists():
-            if self.master.ended:
-                self.master.may_end = True
-                raise MasterUnreachable(f"the master did not start: {self.master.ended}; {self.master.log_tail()}")
-            await asyncio.sleep(POLL_S)
-        self._ready: dict[str, Any] = json.loads(ready_file.read_bytes())
-        self.url = self._ready["url"]
+        self.master, self.url = self._running.child, self._running.url
 
     async def viewer_link(self) -> str | None:
         """A link into the master's viewer, as its operator; None where none is installed."""
-        token = Path(self._ready["operator_token_file"]).read_text().strip()
-        headers = {"Authorization": f"Bearer {token}"}
-        async with httpx.AsyncClient(base_url=self.url, headers=headers, trust_env=False) as client:
+        async with httpx.AsyncClient(base_url=self.url, headers=self._running.as_operator, trust_env=False) as client:
             answer = await client.post("/viewer/links")
         return f"{self.url}{answer.json()['path']}" if answer.is_success else None
 
@@ -150,7 +141,7 @@ class Fleet:
         await self.processes.start(
             "robot",
             "simulation.controller",
-            *("--url", self.url, "--token-file", self._ready["operator_token_file"], "--epoch-ns", str(epoch_ns)),
+            *("--url", self.url, "--token-file", str(self._running.operator_token_file), "--epoch-ns", str(epoch_ns)),
         )
         for index in range(self.options.units):
             await self._start_unit(index, epoch_ns)
@@ -176,7 +167,7 @@ class Fleet:
         document = {
             "source": source.model_dump(mode="json"),
             "master_url": self.url,
-            "token_file": self._ready["unit_token_file"],
+            "token_file": str(self._running.unit_token_file),
             "state_dir": str(state_dir),
             "source_address": address,
             "trace_path": str(trace_path) if options.recorded else None,

@@ -13,6 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType, TracebackType
 
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.errors import CellwatchError
+
 STOP_S = 1.2
 """From the request to stop until the kill; whoever stops all of them counts on two seconds."""
 
@@ -21,6 +24,9 @@ TAIL_LINES = 20
 
 TAIL_BYTES = 8192
 """So many are read for it."""
+
+LOOK_S = 0.005
+"""Between looks for a file."""
 
 PR_SET_PDEATHSIG = 1
 """See prctl(2)."""
@@ -44,6 +50,10 @@ def raise_when_stopped() -> None:
 
     for number in STOP_SIGNALS:
         signal.signal(number, stop)
+
+
+class ChildNotReady(CellwatchError):
+    """A process that was started ended, or was not ready in time."""
 
 
 @dataclass(eq=False)
@@ -160,3 +170,21 @@ class Processes:
             if child.process.returncode is None:
                 child.process.kill()
         await asyncio.wait(waits)
+
+
+async def until_written(child: Child, path: Path, timeout_s: float) -> bytes:
+    """What `child` leaves in a file, as soon as it is there; it must appear whole.
+
+    Raises:
+        ChildNotReady: it ended instead, or took longer than `timeout_s`.
+    """
+    deadline_ns = monotonic_ns() + round(timeout_s * NS_PER_S)
+    while not path.exists():
+        if child.ended or monotonic_ns() > deadline_ns:
+            # It is told now; not once more, as one that failed later.
+            child.may_end = True
+            raise ChildNotReady(
+                f"{child.name}: {child.ended or f'not ready within {timeout_s:g} s'}; {child.log_tail()}"
+            )
+        await asyncio.sleep(LOOK_S)
+    return path.read_bytes()

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,8 +24,9 @@ from benchmarks.faulting.scene import (
 )
 from benchmarks.faulting.watch import SETTLED_S, Asker, Listener, Observer, Present, good
 from shared.clock import NS_PER_S, monotonic_ns
-from shared.errors import CellwatchError
+from shared.errors import CellwatchError, MasterUnreachable
 from simulation.processes import Child, Processes
+from simulation.running_master import start_master
 
 ADDRESSES = ("127.0.0.2", "127.0.0.3")
 
@@ -39,7 +39,7 @@ RETURN_S = 15.0
 """For a map to be good again; what takes longer has missed its mark anyway."""
 
 LOOK_S = 0.005
-"""Between looks at a file."""
+"""Between looks at a log, or at what the map said."""
 
 SETTING = {"margin_base_m": 0.031}
 """Acknowledged before each fault; nobody may forget it."""
@@ -87,24 +87,18 @@ class Site:
         Raises:
             FaultError: it ends instead.
         """
-        ready_file = self.folder / "ready.json"
-        ready_file.unlink(missing_ok=True)
-        self.master = await self.processes.start(
-            self._name("master"), "master_server",
-            *("--cell", str(self.cell), "--host", self.host, "--port", str(self.port), "--public-reads"),
-            *("--state-dir", str(self.master_state), "--ready-file", str(ready_file)),
-            variables=variables,
-        )  # fmt: skip
-
-        ready = await listening(self.master, ready_file)
-        self.port = ready["port"]
-        self.unit_token, operator_token = (Path(ready[f"{role}_token_file"]) for role in ("unit", "operator"))
+        try:
+            running = await start_master(
+                self.processes, self.cell, self.master_state, "--public-reads",
+                name=self._name("master"), host=self.host, port=self.port, variables=variables, ready_s=START_S,
+            )  # fmt: skip
+        except MasterUnreachable as error:
+            raise FaultError(str(error)) from error
+        self.master, self.port = running.child, running.port
+        self.unit_token, self.operator_token = running.unit_token_file, running.operator_token_file
         self.operator = httpx.AsyncClient(
-            base_url=f"http://127.0.0.1:{self.port}",
-            headers={"Authorization": f"Bearer {operator_token.read_text().strip()}"},
-            trust_env=False,
+            base_url=f"http://127.0.0.1:{self.port}", headers=running.as_operator, trust_env=False
         )
-        self.operator_token = operator_token
 
     async def start_robot(self) -> None:
         """Start its controller."""
@@ -241,21 +235,6 @@ def registered(unit: Child) -> bool:
     if unit.failed:
         raise FaultError(f"{unit.name}: {unit.ended}; {unit.log_tail()}")
     return b"registered at" in unit.log.read_bytes()
-
-
-async def listening(master: Child, ready_file: Path) -> Any:
-    """What a master writes that can be asked from now on.
-
-    Raises:
-        FaultError: it ends instead, or takes too long.
-    """
-
-    def look() -> Any:
-        if master.ended:
-            raise FaultError(f"the master did not start: {master.ended}; {master.log_tail()}")
-        return json.loads(ready_file.read_bytes()) if ready_file.exists() else None
-
-    return await until(look, "the master")
 
 
 async def until(

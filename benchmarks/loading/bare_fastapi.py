@@ -17,6 +17,7 @@ import uvicorn
 from fastapi import FastAPI, Request, Response
 
 from shared.clock import monotonic_ns
+from shared.files import write_whole
 from shared.wire import MEDIA_TYPE
 
 app = FastAPI()
@@ -39,10 +40,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     listener = socket.create_server(("127.0.0.1", 0), backlog=256)
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     ready = {"url": f"http://127.0.0.1:{listener.getsockname()[1]}", "pid": os.getpid()}
-    partial = options.ready_file.with_suffix(".partial")
-    partial.write_text(json.dumps(ready))
     # Whoever connects now waits until it is served.
-    partial.replace(options.ready_file)
+    write_whole(options.ready_file, json.dumps(ready).encode(), synced=False)
     config = uvicorn.Config(app, log_config=None, access_log=False, server_header=False, date_header=False)
     uvicorn.Server(config).run(sockets=[listener])
     return 0

@@ -14,7 +14,7 @@ import httpx
 import numpy as np
 import yaml
 
-from benchmarks.faulting.site import FaultError, listening
+from benchmarks.faulting.site import START_S, FaultError
 from benchmarks.plugging.network import Socket, Switch
 from edge_unit.config import ENVIRONMENT_PREFIX as UNIT_PREFIX
 from edge_unit.sources.simulated import SimulatedSourceConfig
@@ -22,6 +22,7 @@ from shared.clock import NS_PER_S, monotonic_ns
 from shared.transforms import Transform
 from simulation.handling import LEFT_ALONE, Handling
 from simulation.processes import Child, Processes
+from simulation.running_master import start_master
 from simulation.world import DEMO_CELL
 
 UNITS = 4
@@ -83,18 +84,14 @@ class PlugSite:
         """Start it, and wait until it can be asked.
 
         Raises:
-            FaultError: it ends instead.
+            MasterUnreachable: it ends instead, or does not come in time.
         """
-        ready_file = self.folder / "ready.json"
-        self.master = await self.processes.start(
-            "master", "master_server",
-            *("--cell", str(DEMO_CELL), "--host", self.switch.address, "--port", str(PORT), "--public-reads"),
-            *("--state-dir", str(self.folder / "master"), "--ready-file", str(ready_file)),
+        running = await start_master(
+            self.processes, DEMO_CELL, self.folder / "master", "--public-reads",
+            host=self.switch.address, port=PORT, ready_s=START_S,
         )  # fmt: skip
-
-        ready = await listening(self.master, ready_file)
-        self.url = f"http://{self.switch.address}:{PORT}"
-        self.unit_token, self.operator_token = (Path(ready[f"{role}_token_file"]) for role in ("unit", "operator"))
+        self.master, self.url = running.child, running.url
+        self.unit_token, self.operator_token = running.unit_token_file, running.operator_token_file
         self.client = httpx.AsyncClient(base_url=self.url, trust_env=False)
 
     async def warm_up(self) -> None:

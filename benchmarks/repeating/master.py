@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import http.client
-import json
 import os
 import socket
 from collections.abc import Sequence
@@ -24,22 +22,19 @@ from benchmarks.loading.traffic import FIRST_ADDRESS, captured_head, with_head
 from benchmarks.repeating.contenders import Sight
 from edge_unit.client import MasterClient
 from shared.camera import Intrinsics
-from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns, stage_ns
+from shared.clock import NS_PER_MS, monotonic_ns, stage_ns
 from shared.errors import MasterRefused, MasterUnreachable, UplinkError, WireError
 from shared.messages import CONTRACT_VERSION, InitializeRequest, UpdateRequest, Versions
 from shared.timebase import Exchange
 from shared.transforms import Transform
 from shared.wire import MEDIA_TYPE, decode_update_answer, encode_update
 from simulation.processes import Processes
+from simulation.running_master import RunningMaster, start_master
 
 STALE_AFTER_S = 60.0
 """Of the master in these measurements: a unit that waits for its turn is not stale meanwhile."""
 
-READY_S = 30.0
-"""For a master to be there on a busy machine."""
-
 TIMEOUT_S = 5.0
-POLL_S = 0.02
 RECEIVE_BYTES = 65536
 
 
@@ -168,23 +163,30 @@ class Rush:
 
 @dataclass(eq=False)
 class Site:
-    """A running master and what is needed to talk to it."""
+    """A running master, and the head of an update's request to it."""
 
-    url: str
-    unit_token: str
-    operator_token: str
-    pid: int
+    master: RunningMaster
     head: bytes
+
+    @property
+    def url(self) -> str:
+        """Of the master."""
+        return self.master.url
+
+    @property
+    def unit_token(self) -> str:
+        """Of the master's units."""
+        return self.master.unit_token
 
     def pin(self, cores: set[int]) -> None:
         """Have the master run on these cores only, all of its threads."""
-        for thread in Path(f"/proc/{self.pid}/task").iterdir():
+        for thread in Path(f"/proc/{self.master.pid}/task").iterdir():
             with contextlib.suppress(ProcessLookupError):
                 os.sched_setaffinity(int(thread.name), cores)
 
     async def change_voxel_size(self, voxel_size_m: float) -> None:
         """Have all units work with voxels of this size; they must register again."""
-        headers = {"Authorization": f"Bearer {self.operator_token}"}
+        headers = self.master.as_operator
         changes: dict[str, Any] = {"voxel_size_m": voxel_size_m, "stale_after_s": STALE_AFTER_S}
         async with httpx.AsyncClient(base_url=self.url, headers=headers, trust_env=False) as client:
             answer = await client.put("/settings", json=changes)
@@ -196,26 +198,10 @@ async def start(processes: Processes, folder: Path, cell: Path) -> Site:
     """A master of this cell on a free port.
 
     Raises:
-        MasterUnreachable: it ends instead.
+        MasterUnreachable: it ends instead, or does not come in time.
     """
-    ready_file = folder / "ready.json"
-    master = await processes.start(
-        "master",
-        "master_server",
-        *("--cell", str(cell), "--host", "127.0.0.1", "--port", "0", "--log-level", "WARNING"),
-        *("--state-dir", str(folder / "state"), "--ready-file", str(ready_file)),
-    )
-    deadline_ns = monotonic_ns() + round(READY_S * NS_PER_S)
-    while not ready_file.exists():
-        if master.ended or monotonic_ns() > deadline_ns:
-            raise MasterUnreachable(f"the master did not start: {master.ended}; {master.log_tail()}")
-        await asyncio.sleep(POLL_S)
-    ready: dict[str, Any] = json.loads(ready_file.read_text())
-    unit_token, operator_token = (
-        Path(ready[name]).read_text(encoding="ascii").strip() for name in ("unit_token_file", "operator_token_file")
-    )
-    head = await captured_head(ready["url"], unit_token)
-    return Site(ready["url"], unit_token, operator_token, ready["pid"], head)
+    master = await start_master(processes, cell, folder / "state", "--log-level", "WARNING")
+    return Site(master, await captured_head(master.url, master.unit_token))
 
 
 def _answer(connection: socket.socket) -> bytes:

@@ -15,6 +15,7 @@ import platform
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import aclosing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -137,8 +138,8 @@ def _compile_kernels(options: argparse.Namespace) -> int:
 async def _look_once(source: DepthSource) -> None:
     await source.open()
     try:
-        async for _ in source.frames():
-            break
+        async with aclosing(source.frames()) as frames:
+            await anext(frames)
     finally:
         await source.close()
 

@@ -18,8 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.repeating import composed, master, running
-from benchmarks.repeating import tables as tables
+from benchmarks.repeating import composed, master, running, tables
 from benchmarks.repeating.book import (
     CONTENDERS,
     ONE_OCTREE,

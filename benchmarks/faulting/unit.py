@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import sys
 from collections.abc import AsyncGenerator
-from pathlib import Path
 
 import numpy as np
 
@@ -50,4 +49,4 @@ def make_source(config: SourceConfig) -> DepthSource:
 
 if __name__ == "__main__":
     edge_unit.source_choice.make_source = make_source
-    sys.exit(main(["run", *map(str, map(Path, sys.argv[1:]))]))
+    sys.exit(main(["run", *sys.argv[1:]]))

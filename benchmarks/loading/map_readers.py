@@ -26,6 +26,7 @@ from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
 from shared.clock import NS_PER_S, monotonic_ns
+from shared.files import write_whole
 from shared.wire import MEDIA_TYPE
 
 ASKING, LISTENING = "GET /voxels", "WS /stream"
@@ -154,9 +155,8 @@ def main() -> None:
         reader.stopped.set()
     for reader in readers:
         reader.join()
-    written = Path(result + ".partial")
-    written.write_text(json.dumps({reader.name: reader.readings for reader in readers}))
-    written.rename(result)
+    readings = json.dumps({reader.name: reader.readings for reader in readers})
+    write_whole(Path(result), readings.encode(), synced=False)
 
 
 if __name__ == "__main__":

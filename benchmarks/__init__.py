@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What Cellwatch is worth, in figures: each command is one module here, its helpers are in a folder above it.
+"""What Cellwatch is worth, in figures: each command is one module here, its helpers are in the folder listed before it.
 
 Each prints its tables and leaves them as JSON in `results/`; `REPORT.md` shows all of them.
 
@@ -26,7 +26,7 @@ In the order of the flow:
     plug_and_play  units are plugged in, moved, exchanged, knocked and covered
     racing/        what `make bench-pipeline` races on, and against whom
     pipeline       what a frame costs, in turns with them
-    loading/       who sends to a master and who reads from it, for `make bench-master` and `make bench-scale`
+    loading/       who sends to a master and who reads from it, for `make bench-master`, `make bench-scale` and others
     master         what one master bears
     scale          one master and more and more units, until it bends
     timing/        what `make bench-latency` follows from camera to robot

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who sends to a master and who reads from it, for `make bench-master` and `make bench-scale`.
+"""Who sends to a master and who reads from it, for `make bench-master`, `make bench-scale` and others.
 
 In the order of the flow:
 

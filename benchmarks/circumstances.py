@@ -18,6 +18,9 @@ PACKAGES = ("numpy", "numba", "trimesh", "fastapi", "uvicorn", "httpx", "open3d"
 LOAD_BEFORE = os.getloadavg()[0]
 """Processes that wanted to run in the minute before this one began: what others did to the figures."""
 
+MEASURED = (":!benchmarks/results", ":!benchmarks/plots", ":!benchmarks/REPORT.md")
+"""What a run itself leaves: it makes no other source of it."""
+
 GIT_S = 5.0
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -39,11 +42,16 @@ def circumstances() -> dict[str, Any]:
 
 def revision() -> str:
     """The commit, with `-dirty` where files differ from it; "unknown" outside of a checkout."""
-    git = ("git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=10", "--exclude=*")
     try:
-        return subprocess.run(git, capture_output=True, text=True, timeout=GIT_S, check=True).stdout.strip()
+        commit, changed = _git("rev-parse", "--short=10", "HEAD"), _git("status", "--porcelain", "--", ".", *MEASURED)
     except (OSError, subprocess.SubprocessError):
         return "unknown"
+    return f"{commit}-dirty" if changed else commit
+
+
+def _git(*command: str) -> str:
+    git = ("git", "-C", str(ROOT), *command)
+    return subprocess.run(git, capture_output=True, text=True, timeout=GIT_S, check=True).stdout.strip()
 
 
 def _cpu() -> str:

@@ -15,6 +15,7 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -27,6 +28,7 @@ from typing import Any
 
 import httpx
 
+from benchmarks.booting import hanging_unit
 from benchmarks.booting.machines import Machine, MachineError, confine, make_network, until, why_not
 from benchmarks.faulting.network import run
 from benchmarks.report import Mark, line, table, write
@@ -58,19 +60,6 @@ BOOT_S_MAX = 400.0
 
 FULL_BYTES = 64 * 1024 * 1024
 """The size of a disk that is filled; state and settings of a unit take a hundredth."""
-
-HANGING_UNIT = """
-import os, sys, time
-from edge_unit import __main__, unit
-process = unit.Unit._process
-def hanging(self, *arguments):
-    while os.path.exists("/run/hang"):
-        time.sleep(0.1)
-    return process(self, *arguments)
-unit.Unit._process = hanging
-sys.exit(__main__.main(["run", "/etc/cellwatch/unit.yaml"]))
-"""
-"""The unit, but for a frame that never comes to its end while a certain file is there."""
 
 HANGING_SERVICE = """
 [Service]
@@ -279,7 +268,7 @@ def site_of(roots: Path, folder: Path) -> Iterator[Site]:
     """A master that runs, and three units that are not switched on yet."""
     hanging = folder / "hanging-unit"
     hanging.mkdir()
-    (hanging / "hanging_unit.py").write_text(HANGING_UNIT)
+    shutil.copy(hanging_unit.__file__, hanging)
     (hanging / "hang.conf").write_text(HANGING_SERVICE)
     nothing = folder / "nothing"
     nothing.mkdir()

@@ -3,6 +3,7 @@
 
 In the order of the flow:
 
+    hanging_unit what runs on a machine whose frame hangs
     machines    machines that boot systemd from one read-only root file system
     image_parts the image that arm64 boards boot in QEMU, built as a board's is
     emulated    one such board

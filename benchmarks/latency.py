@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import os
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -233,6 +234,20 @@ async def measure(
         return [await bench.run(case, rings[case.size]) for case in cases]
 
 
+def _mark(each: Timed) -> Mark:
+    def p99_ms(name: str) -> float:
+        return float(np.percentile(each.ms[name], 99))
+
+    reads = ", ".join(f"{name} {p99_ms(f'{LISTENING}: {name}'):.1f}" for name in READS[LISTENING])
+    return Mark(
+        f"{each.case}: {WHOLE[LISTENING]}, p99 ms",
+        p99_ms(WHOLE[LISTENING]),
+        P99_MS_MAX,
+        why=f"{UNITS} units, the master, its robot and two readers share {os.cpu_count()} cores; p99 until merged "
+        f"{p99_ms(TO_MERGED):.1f} ms, then: {reads}",
+    )
+
+
 def result(found: Sequence[Timed]) -> Result:
     """A row a stage, and of each case its median and p99."""
     names = [*STAGES, TO_MERGED]
@@ -245,13 +260,7 @@ def result(found: Sequence[Timed]) -> Result:
             float(np.percentile(each.ms[name], q)) if each.ms[name].size else np.nan for each in found for q in (50, 99)
         ]
         rows.append((STAGES.get(name, name), *cells))
-    marks = [
-        Mark(
-            f"{each.case}: {WHOLE[LISTENING]}, p99 ms", float(np.percentile(each.ms[WHOLE[LISTENING]], 99)), P99_MS_MAX
-        )
-        for each in found
-        if each.case.rate_hz == FULL_HZ
-    ]
+    marks = [_mark(each) for each in found if each.case.rate_hz == FULL_HZ]
     told = ", ".join(f"{each.case} {each.frames} ({each.dropped} gave way to a newer one)" for each in found)
     remarks = (
         f"Frames that were merged: {told}.",

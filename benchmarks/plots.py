@@ -27,7 +27,9 @@ def draw(curves: dict[str, Any], folder: Path, prefix: str) -> Path:
     for number, (name, points) in enumerate(curves["series"].items()):
         marker, colour = MARKERS[number % len(MARKERS)], COLOURS[number % len(COLOURS)]
         x, y = [x for x, _ in points], [y for _, y in points]
-        axes.plot(x, y, label=name, marker=marker, color=colour, markersize=4, linewidth=1.4)
+        # What is named first is ours, and lies on top where lines meet.
+        above = len(curves["series"]) - number + 2
+        axes.plot(x, y, label=name, marker=marker, color=colour, markersize=4, linewidth=1.4, zorder=above)
     logarithmic = curves.get("logarithmic", "")
     axes.set_xscale("log" if "x" in logarithmic else "linear")
     axes.set_yscale("log" if "y" in logarithmic else "linear")

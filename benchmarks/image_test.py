@@ -25,7 +25,7 @@ from benchmarks.booting.emulated import Board, why_no_boards
 from benchmarks.booting.image_parts import CACHE, CELL, build, why_not_built
 from benchmarks.booting.machines import BRIDGE, NAMESPACES, MachineError, confine, until
 from benchmarks.faulting.network import allowed, run
-from benchmarks.report import line, write
+from benchmarks.report import Mark, Result, line, write
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, ConfigError
 from simulation.processes import raise_when_stopped
@@ -205,10 +205,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
         document["error"] = "interrupted"
     document["seconds"] = round((monotonic_ns() - began_ns) / NS_PER_S, 1)
     document["load"] = round(os.getloadavg()[0], 1)
+    result = result_of(document)
+    print(result)
     if not options.no_results:
-        write("image_test", document)
+        write("image_test", document | {"table": result.document()})
     print(line(document))
-    return 0 if document["machines_posting"] == document["distinct_names"] == BOARDS else 1
+    return 0 if all(mark.met for mark in result.marks) else 1
+
+
+def result_of(document: dict[str, Any]) -> Result:
+    """For people; what did not come about has no figure."""
+    figures = (
+        ("from power-on to the first voxel, s", document.get("seconds_power_on_to_first_voxel")),
+        ("image, MB", document.get("image_mb")),
+        ("of that the release, MB", document.get("payload_mb")),
+        ("all of it, with what had to be built, s", document.get("seconds")),
+    )
+    return Result(
+        f"{BOARDS} arm64 boards of one image, every instruction emulated",
+        ("what", "figure"),
+        tuple((name, float("nan") if value is None else float(value)) for name, value in figures),
+        (
+            Mark("boards that report", float(document["machines_posting"]), at_least=BOARDS),
+            Mark("distinct names", float(document["distinct_names"]), at_least=BOARDS),
+        ),
+    )
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -74,15 +74,20 @@ class Coverage:
         seen = self._seen.get(unit_id)
         if seen is None:
             return None
-        ix, iy, iz = np.nonzero(seen)
-        if not ix.size:
+        if not seen.any():
             return None
-        # The depth of a block's centre is linear in its indices: no points are made of them.
+        # The depth of a block's centre is linear in its indices: no points are made of them. Blocks that are not
+        # seen count as none deeper than the camera itself.
         forward, eye = np.array(T_world_camera)[:3, 2], np.array(T_world_camera)[:3, 3]
         edge_m = self.blocks.voxel_size_m
         first = float(forward @ (np.array(self.blocks.origin_m) + 0.5 * edge_m - eye))
-        steps = (edge_m * forward).astype(np.float32)
-        return max(first + float((ix * steps[0] + iy * steps[1] + iz * steps[2]).max()), 0.0)
+        x, y, z = (
+            np.arange(count, dtype=np.float32) * np.float32(edge_m * step)
+            for count, step in zip(seen.shape, forward, strict=True)
+        )
+        depth_m = (np.float32(first) + x[:, None] + y)[..., None] + z
+        depth_m *= seen
+        return max(float(depth_m.max()), 0.0)
 
     def seen_by(self, unit_ids: Iterable[int]) -> NDArray[np.uint8]:
         """How many of these units look through each block, in the blocks' shape, uint8."""

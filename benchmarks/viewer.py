@@ -105,8 +105,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "update p99 with one who looks, times that with nobody",
             found["update_p99_ratio_1_viewer"],
             at_most=RATIO_OF_ONE,
-            why=f"with nobody it is {found['update_p99_ms']:.2f} ms; master and window share one core, those who look and "
-            "the load the other: an update that comes while the window asks, ten times a second, waits for it",
+            why=f"with nobody it is {found['update_p99_ms']:.2f} ms; master and window share one core, those who look "
+            "and the load the other: an update that comes while the window asks, ten times a second, waits for it",
         ),
         Mark(
             "update p99 with ten who look, times that with nobody",

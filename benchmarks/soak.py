@@ -17,7 +17,7 @@ import random
 import shutil
 import sys
 import tempfile
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -230,9 +230,9 @@ class _Beside:
 def results(found: Found) -> dict[str, Result]:
     """What happened, what came of it, and what the processes held."""
     counts = Counter(strike.name for strike in found.strikes)
-    held_s = Counter[str]()
+    held_s: defaultdict[str, float] = defaultdict(float)
     for strike in found.strikes:
-        held_s[strike.name] += strike.hold_s  # type: ignore[assignment]
+        held_s[strike.name] += strike.hold_s
     faults = Result(
         "What happened",
         ("fault", "times", "s in all"),

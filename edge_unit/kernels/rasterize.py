@@ -120,7 +120,7 @@ def list_faces(
         aways += np.uint64(kind == SMALL + AWAY)
         larges += np.uint64((kind == LARGE) | (kind == LARGE + AWAY))
     # To numba they are plain numbers.
-    return np.int64(heres), np.int64(aways), np.int64(larges)  # type: ignore[return-value]
+    return np.int64(heres), np.int64(aways), np.int64(larges)  # type: ignore[return-value]  # plain numbers to numba
 
 
 @kernel

@@ -89,7 +89,7 @@ def next_empty(words: NDArray[np.uint64], start: int) -> int:
     word, end = np.uint64(start), np.uint64(len(words))
     while word < end and words[word] != 0:
         word += np.uint64(1)
-    return np.int64(word)  # type: ignore[return-value]
+    return np.int64(word)  # type: ignore[return-value]  # to numba it is a plain number
 
 
 @kernel

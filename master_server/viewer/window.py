@@ -54,7 +54,7 @@ class Window:
         self._voxels: Voxels | None = None
         self.server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         # Nobody opens a tunnel to the world from here; the master does not pass such requests on, either.
-        self.server.request_share_url = _refuse_to_share  # type: ignore[method-assign]
+        self.server.request_share_url = _refuse_to_share  # type: ignore[method-assign]  # viser has no switch for it
         # viser asks nobody who they are; so before all else, this does.
         self.server._websock_server._client_connect_cb.insert(0, self._admit)
         self.server.on_client_connect(self._come)

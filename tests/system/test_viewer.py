@@ -238,7 +238,7 @@ def test_each_camera_shows_its_own_view(cluster: TerminalCluster, page: Page) ->
         assert unit["range_m"] == 2.95
         own, others = (range_lines(page, unit, one["intrinsics"]) for one in (unit, other))
         assert len(own) > 60
-        picture = until_shown(page, lambda picture, own=own: share_lined(picture, own) > 0.8, "ranges")  # type: ignore[misc]
+        picture = until_shown(page, lambda picture, own=own: share_lined(picture, own) > 0.8, "ranges")  # type: ignore[misc]  # a default binds `own`
         assert share_lined(picture, others) < 0.4
     page.get_by_role("checkbox", name="how far cameras see").uncheck(force=True)
     places = range_lines(page, wide, wide["intrinsics"])

@@ -13,7 +13,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
 BENCH_READY := $(VENV)/ready-bench
-TYPED := $(patsubst %/,%,$(dir $(wildcard $(addsuffix /__init__.py,shared edge_unit master_server simulation benchmarks))))
+TYPED := $(patsubst %/,%,$(dir $(wildcard $(addsuffix /__init__.py,shared geometry edge_unit master_server simulation benchmarks qualification))))
 
 # Recorded data, where it lies beside the checkout.
 ifneq ($(wildcard ../shared/data),)
@@ -37,13 +37,13 @@ right-time: $(READY) ## joints that come late, jittering, seldom: the robot filt
 	@$(BIN)/python -m benchmarks.right_time $(ARGS)
 
 source-faults: $(READY) libusb ## a RealSense camera that hangs, dies and is unplugged: how long until frames flow again
-	@$(BIN)/python -m benchmarks.source_faults $(ARGS)
+	@$(BIN)/python -m qualification.source_faults $(ARGS)
 
 faults: $(READY) ## units, master, networks, clocks and disks that fail: what the map says meanwhile
-	@$(BIN)/python -m benchmarks.faults $(ARGS)
+	@$(BIN)/python -m qualification.faults $(ARGS)
 
 plug-and-play: $(READY) ## four units that know nothing but a token, and what people do to them later
-	@$(BIN)/python -m benchmarks.plug_and_play $(ARGS)
+	@$(BIN)/python -m qualification.plug_and_play $(ARGS)
 
 bench: $(BENCH_READY) libusb ## what Cellwatch claims, measured anew in some 20 minutes: benchmarks/REPORT.md
 	@$(BIN)/python -m benchmarks.bench $(ARGS)
@@ -64,29 +64,29 @@ bench-latency: $(READY) ## where the milliseconds go from the capture of a frame
 	@$(BIN)/python -m benchmarks.latency $(ARGS)
 
 soak: $(READY) ## all sorts of faults at once for MINUTES (30): no answer wrong, nothing grows; SEED=n for the same again
-	@$(BIN)/python -m benchmarks.soak --minutes $(MINUTES) $(if $(SEED),--seed $(SEED)) $(ARGS)
+	@$(BIN)/python -m qualification.soak --minutes $(MINUTES) $(if $(SEED),--seed $(SEED)) $(ARGS)
 
 bench-board: $(READY) ## how well a camera's pose is found by a calibration board, by distance
 	@$(BIN)/python -m benchmarks.board $(ARGS)
 
 bench-stance: $(READY) ## how soon a knocked or covered camera is told, and how often one is wrongly suspected
-	@$(BIN)/python -m benchmarks.stance $(ARGS)
+	@$(BIN)/python -m benchmarks.pose_monitor $(ARGS)
 
 bench-paper: $(BENCH_READY) libusb ## the paper's experiment: one to four cameras, distributed against centralised and OctoMap
 	@$(BIN)/python -m benchmarks.paper $(ARGS)
 
 viewer-test: $(READY) ## the operator's window in a real browser, and what those who look cost the units
-	@$(BIN)/python -m benchmarks.viewer $(ARGS)
+	@$(BIN)/python -m qualification.window $(ARGS)
 
 rehearsal: $(READY) ## a master and three units as machines that boot from what a board is given (root, systemd-nspawn)
-	@$(BIN)/python -m benchmarks.rehearsal $(ARGS)
+	@$(BIN)/python -m qualification.boot $(ARGS)
 
 image-test: $(READY) ## two arm64 boards boot from one image, find a master and report to it (root, QEMU)
-	@$(BIN)/python -m benchmarks.image_test $(ARGS)
+	@$(BIN)/python -m qualification.image $(ARGS)
 
 pictures: $(READY) ## the pictures of the README, painted anew
-	@$(BIN)/python -m simulation.picture assets/pictures/demo.png
-	@$(BIN)/python -m simulation.window_pictures assets/pictures
+	@$(BIN)/python -m simulation.demo.picture assets/pictures/demo.png
+	@$(BIN)/python -m simulation.demo.window_pictures assets/pictures
 
 test: $(READY) libusb lint ## lint, then all tests but the slow ones; with SLOW=1 these too
 	@$(BIN)/python -m pytest -q $(if $(SLOW),,-m "not slow") $(ARGS)

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import real_frames
-from benchmarks.judging import plan, real
-from benchmarks.judging.curves import EVERYTHING, Collection, Curve, by_thing, tables, worse
-from benchmarks.judging.plan import (
+from benchmarks.ground_truth import plan, real
+from benchmarks.ground_truth.curves import EVERYTHING, Collection, Curve, by_thing, tables, worse
+from benchmarks.ground_truth.plan import (
     ARM,
     BASELINES,
     CONTENDERS,
@@ -33,17 +33,17 @@ from benchmarks.judging.plan import (
     Amount,
     AnyTrial,
 )
-from benchmarks.judging.real import Judged
-from benchmarks.judging.rules import MinimumPoints, Paper, Place
-from benchmarks.judging.stage import Stage
-from benchmarks.judging.trials import Tallies, Trial
-from benchmarks.judging.truth import visible_pixels_min
-from benchmarks.report import RESULTS, Mark, line, write
+from benchmarks.ground_truth.real import Judged
+from benchmarks.ground_truth.rules import MinimumPoints, Paper, Place
+from benchmarks.ground_truth.stage import Stage
+from benchmarks.ground_truth.surface import visible_pixels_min
+from benchmarks.ground_truth.trials import Tallies, Trial
+from benchmarks.reporting.report import RESULTS, Mark, line, write
 from benchmarks.sweeps import runner
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import SourceError
 from shared.settings import FilterSettings
-from simulation.depth_noise import DepthNoise
+from simulation.cameras.depth_noise import DepthNoise
 
 REAL = "real"
 PARTS = (*TRIALS, REAL)

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.parts import PARTS, Part
-from benchmarks.report import RESULTS, line, table
-from benchmarks.report_page import REPORT, write_page
+from benchmarks.reporting.page import REPORT, write_page
+from benchmarks.reporting.parts import PARTS, Part
+from benchmarks.reporting.report import RESULTS, line, table
 from shared.clock import NS_PER_S, monotonic_ns
 
 

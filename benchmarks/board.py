@@ -20,16 +20,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import RESULTS, Mark, Result, line, write
+from benchmarks.reporting.report import RESULTS, Mark, Result, line, write
 from benchmarks.sweeps import runner
-from edge_unit.board_layout import BoardLayout
-from edge_unit.localise import BoardLocaliser
+from edge_unit.calibration.board_layout import BoardLayout
+from edge_unit.calibration.board_pose import BoardLocaliser
 from shared.camera import Intrinsics
 from shared.cell import Board
 from shared.clock import NS_PER_MS, monotonic_ns
 from shared.errors import BoardError
 from shared.transforms import angle_rad, from_rotation_translation, identity, inverse, rotation_about
-from simulation.board_picture import BoardPicture
+from simulation.cameras.board_picture import BoardPicture
 
 FRAMES = 10
 """Of a view: what a unit takes before it is content."""

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge_unit.joints import JointEstimate, JointHistory
-from master_server.robot import RobotJoints
+from master_server.core import RobotJoints
 from shared.clock import NS_PER_S
 from shared.messages import JointsRequest
-from simulation.robot_path import JointPath
+from simulation.world.robot_path import JointPath
 
 EPOCH_NS = NS_PER_S
 """The master's clock at the path's time 0."""

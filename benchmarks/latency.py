@@ -25,19 +25,19 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from benchmarks.loading.map_readers import ASKING, BEGUN, LISTENING, Reading, read
-from benchmarks.report import RESULTS, Mark, Result, line, write
+from benchmarks.latency_probe.frames import FRAMES, PERIOD_S, RING_HZ, prepare
+from benchmarks.load_generator.map_readers import ASKING, BEGUN, LISTENING, Reading, read
+from benchmarks.reporting.report import RESULTS, Mark, Result, line, write
 from benchmarks.sweeps import runner
-from benchmarks.timing.frames import FRAMES, PERIOD_S, RING_HZ, prepare
 from edge_unit.config import ENVIRONMENT_PREFIX as UNIT_PREFIX
+from edge_unit.monitoring import TraceRecord, read_trace
 from edge_unit.sources.simulated import SimulatedSourceConfig
-from edge_unit.trace import TraceRecord, read_trace
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, UplinkError
-from simulation.fleet import FIRST_ADDRESS, MASTER_PREFIX
-from simulation.processes import Child, Processes, until_written
-from simulation.running_master import start_master
-from simulation.world import DEMO_CELL
+from simulation.fleet.fleet import FIRST_ADDRESS, MASTER_PREFIX
+from simulation.fleet.processes import Child, Processes, until_written
+from simulation.fleet.running_master import start_master
+from simulation.world.world import DEMO_CELL
 
 UNITS = 4
 SIZES = ((424, 240), (848, 480))
@@ -164,7 +164,7 @@ class Bench:
         master, url, operator = running.child, running.url, str(running.operator_token_file)
         epoch_ns = monotonic_ns()
         robot = await self._start(
-            "robot", "simulation.controller",
+            "robot", "simulation.fleet.controller",
             *("--url", url, "--token-file", operator, "--epoch-ns", str(epoch_ns)),
         )  # fmt: skip
         traces, units = [], []
@@ -187,10 +187,12 @@ class Bench:
             }
             config = state / "unit.yaml"
             config.write_text(yaml.safe_dump(document))
-            units.append(await self._start(f"unit{camera + 1}", "benchmarks.timing.unit", str(config)))
+            units.append(await self._start(f"unit{camera + 1}", "benchmarks.latency_probe.unit", str(config)))
         await self._all_live(url, (master, robot, *units))
         await asyncio.sleep(SETTLE_S)
-        readers = await self._start("readers", "benchmarks.loading.map_readers", url, operator, str(ASK_S), str(result))
+        readers = await self._start(
+            "readers", "benchmarks.load_generator.map_readers", url, operator, str(ASK_S), str(result)
+        )
         await until_written(readers, result.with_suffix(BEGUN), START_S)
         began_ns = monotonic_ns()
         await asyncio.sleep(self._seconds + TAIL_S)

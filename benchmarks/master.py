@@ -19,13 +19,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from benchmarks.loading.load import FRAME_RATE_HZ, Plan
-from benchmarks.report import RESULTS, Mark, Result, line, write
+from benchmarks.load_generator.load import FRAME_RATE_HZ, Plan
+from benchmarks.reporting.report import RESULTS, Mark, Result, line, write
 from shared.errors import CellwatchError, UplinkError
-from simulation.fleet import MASTER_PREFIX
-from simulation.processes import Child, Processes, until_written
-from simulation.running_master import READY_S, RunningMaster, start_master
-from simulation.world import DEMO_CELL
+from simulation.fleet.fleet import MASTER_PREFIX
+from simulation.fleet.processes import Child, Processes, until_written
+from simulation.fleet.running_master import READY_S, RunningMaster, start_master
+from simulation.world.world import DEMO_CELL
 
 UNITS = (1, 4, 10, 50)
 VOXELS = (100, 1000)
@@ -94,7 +94,7 @@ class Bench:
             children.append(
                 await self._processes.start(
                     "controller",
-                    "simulation.controller",
+                    "simulation.fleet.controller",
                     *("--url", url, "--token-file", str(master.operator_token_file)),
                 )
             )
@@ -109,7 +109,7 @@ class Bench:
         result.unlink(missing_ok=True)
         (self._folder / "plan.json").write_text(json.dumps(asdict(plan)))
         load = await self._processes.start(
-            "load", "benchmarks.loading.load", str(self._folder / "plan.json"), str(result), may_end=True
+            "load", "benchmarks.load_generator.load", str(self._folder / "plan.json"), str(result), may_end=True
         )
         await load.process.wait()
         failed = [child for child in (*children, load) if child.failed]
@@ -126,7 +126,7 @@ class Bench:
         seeing.unlink(missing_ok=True)
         watchers = await self._processes.start(
             "watchers",
-            "benchmarks.loading.watchers",
+            "benchmarks.load_generator.watchers",
             *(master.url, str(master.operator_token_file), str(master.pid), str(viewers), str(seeing)),
         )
         await until_written(watchers, seeing, READY_S)
@@ -136,7 +136,9 @@ class Bench:
         """The bare route, its URL and the number of its process."""
         ready_file = self._folder / "bare.json"
         ready_file.unlink(missing_ok=True)
-        server = await self._processes.start("bare", "benchmarks.loading.bare_fastapi", "--ready-file", str(ready_file))
+        server = await self._processes.start(
+            "bare", "benchmarks.load_generator.bare_fastapi", "--ready-file", str(ready_file)
+        )
         ready = json.loads(await until_written(server, ready_file, READY_S))
         return server, ready["url"], ready["pid"]
 

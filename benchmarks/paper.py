@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.repeating import composed, master, running, tables
-from benchmarks.repeating.book import (
+from benchmarks.paper_experiment import composed, master, running, tables
+from benchmarks.paper_experiment.book import (
     CONTENDERS,
     ONE_OCTREE,
     ONE_PROCESS,
@@ -30,12 +30,12 @@ from benchmarks.repeating.book import (
     Book,
     in_mm,
 )
-from benchmarks.repeating.scene import Views, views, write_cell
-from benchmarks.report import RESULTS, Curves, Result, line, write
+from benchmarks.paper_experiment.scene import Views, views, write_cell
+from benchmarks.reporting.report import RESULTS, Curves, Result, line, write
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError
-from simulation.fleet import MASTER_PREFIX
-from simulation.processes import Processes
+from simulation.fleet.fleet import MASTER_PREFIX
+from simulation.fleet.processes import Processes
 
 VOXEL_M = 0.02
 """Where one size stands for all."""

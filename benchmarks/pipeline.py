@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.racing.ur3_scene import Recording, record
-from benchmarks.report import RESULTS, Mark, Result, line, write
+from benchmarks.peers.ur3_scene import Recording, record
+from benchmarks.reporting.report import RESULTS, Mark, Result, line, write
 from edge_unit.pipeline import DepthPipeline
 from shared.clock import NS_PER_MS, stage_ns
 from shared.errors import CellwatchError
@@ -80,7 +80,7 @@ def in_turns(contenders: Mapping[str, Work], turns: int, frames: int = FRAMES) -
 
 def contenders_of(frames: Recording) -> dict[str, Work]:
     """Ours and theirs, by name; each takes the number of a frame."""
-    from benchmarks.racing import peers
+    from benchmarks.peers import contenders as peers
 
     pipeline, still = frames.pipeline(VOXEL_M), frames.pipeline(VOXEL_M)
     unknowing = frames.pipeline_that_knows_nothing(WORST_VOXEL_M)
@@ -122,7 +122,7 @@ def contenders_of(frames: Recording) -> dict[str, Work]:
 
 def compare(frames: Recording, turns: int) -> tuple[dict[str, Any], list[Mark]]:
     """What a frame costs beside its peers: figures by name, and the marks that they are held against."""
-    from benchmarks.racing.peers import PEERS
+    from benchmarks.peers.contenders import PEERS
 
     spent = in_turns(contenders_of(frames), turns, len(frames.depth))
     result = Result(

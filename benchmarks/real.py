@@ -25,20 +25,20 @@ from numpy.typing import NDArray
 
 from benchmarks import real_frames
 from benchmarks.real_frames import EMPTY_FRAMES, WATCHED_FRAMES, FrameMarks, RealFrames
-from benchmarks.report import RESULTS, Mark, Result, line, write
+from benchmarks.reporting.report import RESULTS, Mark, Result, line, write
 from edge_unit.config import ENVIRONMENT_PREFIX as UNIT_PREFIX
 from edge_unit.config import SourceConfig
+from edge_unit.monitoring import read_trace
 from edge_unit.pipeline import DepthPipeline
-from edge_unit.recording import record_images
-from edge_unit.sources.realsense import RealsenseSourceConfig
+from edge_unit.sources.realsense.bag_writer import record_images
+from edge_unit.sources.realsense.source import RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSourceConfig, open_recording
-from edge_unit.trace import read_trace
 from master_server.config import ENVIRONMENT_PREFIX as MASTER_PREFIX
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, SourceError
 from shared.waiting import within
-from simulation.processes import Child, Processes
-from simulation.running_master import RunningMaster, start_master
+from simulation.fleet.processes import Child, Processes
+from simulation.fleet.running_master import RunningMaster, start_master
 
 READY_S = 60.0
 """For a process to come up and compile its kernels on a slow machine."""

@@ -16,8 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_unit.pipeline import DepthPipeline
-from edge_unit.voxels import Voxels
+from edge_unit.pipeline import DepthPipeline, Voxels
 from shared.cell import Cell
 from shared.errors import SourceError
 from shared.lattice import Lattice

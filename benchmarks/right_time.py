@@ -22,25 +22,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.joint_delivery import Delivered, Delivery
-from benchmarks.report import RESULTS, Mark, Result, line, write
-from benchmarks.sweeping.stage import reported_at
+from benchmarks.reporting.report import RESULTS, Mark, Result, line, write
+from benchmarks.sweep_scenes.stage import reported_at
 from benchmarks.sweeps import runner
-from edge_unit.delay_watch import LOOKS_MAX
-from edge_unit.joint_delay import DelayEstimate, DelayLook, estimate_delay
-from edge_unit.joint_delay import look_at as look_at_frame
-from edge_unit.joints import JointEstimate
-from edge_unit.pipeline import DepthPipeline
-from edge_unit.voxels import Voxels
+from edge_unit.joints import DelayEstimate, DelayLook, JointEstimate, estimate_delay
+from edge_unit.joints import look_at as look_at_frame
+from edge_unit.joints.delay_monitor import LOOKS_MAX
+from edge_unit.pipeline import DepthPipeline, Voxels
 from shared.camera import Intrinsics
 from shared.meshes import box_mesh
 from shared.settings import Settings
 from shared.transforms import apply, from_xyz_rpy, look_at
-from simulation.camera import SimulatedCamera, d435i_intrinsics, rig
-from simulation.depth_noise import DepthNoise, DepthSensor
-from simulation.raycast import RaycastRenderer
-from simulation.robot_path import JointPath, RobotPath, ShuttlePath
-from simulation.scene import Body, Owner
-from simulation.world import World
+from simulation.cameras.camera import SimulatedCamera, d435i_intrinsics, rig
+from simulation.cameras.depth_noise import DepthNoise, DepthSensor
+from simulation.cameras.raycast import RaycastRenderer
+from simulation.world.robot_path import JointPath, RobotPath, ShuttlePath
+from simulation.world.scene import Body, Owner
+from simulation.world.world import World
 
 FRAMES = 500
 FPS = 15.0

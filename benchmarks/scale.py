@@ -24,19 +24,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.loading.map_readers import ASKING, BEGUN, LISTENING, Reading, read
-from benchmarks.loading.merge_costs import MergeCost, merge_costs
-from benchmarks.loading.scale_load import ScalePlan, Step
-from benchmarks.loading.traffic import AGE_NS
-from benchmarks.report import RESULTS, Curves, Mark, Result, line, write
-from master_server.registry import MAX_UNITS
+from benchmarks.load_generator.map_readers import ASKING, BEGUN, LISTENING, Reading, read
+from benchmarks.load_generator.merge_costs import MergeCost, merge_costs
+from benchmarks.load_generator.scale_load import ScalePlan, Step
+from benchmarks.load_generator.traffic import AGE_NS
+from benchmarks.reporting.report import RESULTS, Curves, Mark, Result, line, write
+from master_server.core.units import MAX_UNITS
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, UplinkError
 from shared.settings import Settings
-from simulation.fleet import MASTER_PREFIX
-from simulation.processes import Processes, until_written
-from simulation.running_master import READY_S, start_master
-from simulation.world import DEMO_CELL
+from simulation.fleet.fleet import MASTER_PREFIX
+from simulation.fleet.processes import Processes, until_written
+from simulation.fleet.running_master import READY_S, start_master
+from simulation.world.world import DEMO_CELL
 
 UNITS = (1, 2, 4, 8, 16, 32, 50, 64, 100, 200)
 RATES_HZ = (15.0, 30.0)
@@ -125,10 +125,15 @@ class Bench:
         os.sched_setaffinity(0, {self._load_core})
         url, operator = master.url, str(master.operator_token_file)
         robot = await self._processes.start(
-            f"robot-{self._count}", "simulation.controller", "--url", url, "--token-file", operator
+            f"robot-{self._count}", "simulation.fleet.controller", "--url", url, "--token-file", operator
         )
         readers = await self._processes.start(
-            f"readers-{self._count}", "benchmarks.loading.map_readers", url, operator, str(ASK_S), str(folder / "read")
+            f"readers-{self._count}",
+            "benchmarks.load_generator.map_readers",
+            url,
+            operator,
+            str(ASK_S),
+            str(folder / "read"),
         )
         await until_written(readers, folder / f"read{BEGUN}", READY_S)
         options = self._options
@@ -138,7 +143,7 @@ class Bench:
         )  # fmt: skip
         plan_file.write_text(json.dumps(asdict(plan)))
         load = await self._processes.start(
-            f"load-{self._count}", "benchmarks.loading.scale_load", str(plan_file), str(result), may_end=True
+            f"load-{self._count}", "benchmarks.load_generator.scale_load", str(plan_file), str(result), may_end=True
         )
         code = await load.process.wait()
         readers.may_end = True
@@ -168,7 +173,7 @@ async def measure(options: argparse.Namespace) -> tuple[list[Row], str]:
             if refused is None:
                 return rows, ""
             beyond = tuple(count for count in options.units if count >= refused["units"])
-            wide, _ = await bench.run("benchmarks.loading.wide_master", beyond)
+            wide, _ = await bench.run("benchmarks.load_generator.wide_master", beyond)
             return rows + wide, f"{refused['units']} units: {refused['refused']}"
 
 

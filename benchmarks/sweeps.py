@@ -20,12 +20,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.report import RESULTS, Result, line, write
-from benchmarks.sweeping import quiet, shapes, thickness, walkers
+from benchmarks.reporting.report import RESULTS, Result, line, write
+from benchmarks.sweep_scenes import quiet, shapes, thickness, walkers
 from shared.camera import Intrinsics
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.settings import FilterSettings
-from simulation.camera import D435I_FOCAL_PX, d435i_intrinsics
+from simulation.cameras.camera import D435I_FOCAL_PX, d435i_intrinsics
 
 SWEEPS = ("thickness", "curve", "shapes", "quiet", "walkers")
 

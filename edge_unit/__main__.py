@@ -19,18 +19,18 @@ from contextlib import aclosing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edge_unit.carried_kernels import TARGETS, target_of
 from edge_unit.config import ENVIRONMENT_PREFIX, UnitConfig
-from edge_unit.jit_cache import settle, settle_for
-from edge_unit.sources.frame import DepthSource
+from edge_unit.sources import DepthSource
 from edge_unit.sources.recorded import RecordedSourceConfig
 from edge_unit.sources.simulated import SimulatedSource, SimulatedSourceConfig
+from geometry.compilation.cache import settle, settle_for
+from geometry.compilation.prebuilt import TARGETS, target_of
 from shared.configuration import assignments, load
 from shared.errors import CellwatchError, ConfigError
 from shared.service import ServiceManager
 
 if TYPE_CHECKING:
-    from edge_unit.unit import Unit
+    from edge_unit.daemon.unit import Unit
 
 logger = logging.getLogger("edge_unit")
 
@@ -56,8 +56,8 @@ def _run(options: argparse.Namespace) -> int:
     if config.jit_cache_dir is not None:
         settle(config.jit_cache_dir)
     # Imported only now, for kernels settle where they are kept when they are imported.
-    from edge_unit.source_choice import make_source
-    from edge_unit.unit import Unit
+    from edge_unit.daemon.unit import Unit
+    from edge_unit.source_factory import make_source
 
     asyncio.run(_until_told_to_stop(Unit(config, make_source(config.source))))
     return 0
@@ -83,7 +83,7 @@ def _doctor(options: argparse.Namespace) -> int:
 
 
 def _record_images(options: argparse.Namespace) -> int:
-    from edge_unit.recording import record_images
+    from edge_unit.sources.realsense.bag_writer import record_images
 
     images = load(RecordedSourceConfig, None, {}, "", {"folder": options.folder, **assignments(options.set)})
     count = record_images(images, options.recording, options.fps)
@@ -92,7 +92,7 @@ def _record_images(options: argparse.Namespace) -> int:
 
 
 def _joint_delay(options: argparse.Namespace) -> int:
-    from edge_unit.recorded_delay import delay_of_recording
+    from edge_unit.joints import delay_of_recording
     from shared.cell import Cell
 
     images = load(RecordedSourceConfig, None, {}, "", {"folder": options.folder, **assignments(options.set)})
@@ -105,8 +105,8 @@ def _joint_delay(options: argparse.Namespace) -> int:
 
 
 def _board(options: argparse.Namespace) -> int:
-    from edge_unit.board_layout import BoardLayout, require_board
-    from edge_unit.board_print import page_of, smallest_page, write_board
+    from edge_unit.calibration.board_layout import BoardLayout, require_board
+    from edge_unit.calibration.board_pdf import page_of, smallest_page, write_board
     from shared.cell import board_of
     from shared.cell_file import read_cell_file
 
@@ -124,7 +124,7 @@ def _compile_kernels(options: argparse.Namespace) -> int:
     if target is None or target.machine != platform.machine():
         raise ConfigError(f"--target: kernels are compiled on {platform.machine()} for {platform.machine()} only")
     folder = settle_for(target, options.folder)
-    from edge_unit.rehearsal import rehearse
+    from edge_unit.daemon.warm_up import rehearse
 
     rehearse()
     if options.config is not None:

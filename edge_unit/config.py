@@ -13,10 +13,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, field_validator, model_validator
 
 from edge_unit.sources.image import ImageStream
-from edge_unit.sources.realsense import RealsenseSourceConfig
+from edge_unit.sources.realsense.source import RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSourceConfig, read_pose
 from edge_unit.sources.simulated import SimulatedSourceConfig
-from edge_unit.trust import normalised, tls_context
+from edge_unit.tls import normalised, tls_context
 from shared.errors import ConfigError
 from shared.messages import MAX_TEXT
 from shared.transforms import Transform, from_xyz_rpy, validated

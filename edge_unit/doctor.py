@@ -17,18 +17,18 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_unit.cell_cache import mesh_hashes
-from edge_unit.client import MasterClient
 from edge_unit.config import UnitConfig
-from edge_unit.host import clock_is_set, usb_cameras
-from edge_unit.jit_cache import PRIVATE, settle
-from edge_unit.master_choice import Place, choose, first_place
-from edge_unit.master_search import judged, kept_of, reach, wanted_of
-from edge_unit.sources import capture_link as link
-from edge_unit.sources.capture_session import CaptureSession
-from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
-from edge_unit.sources.realsense import RealsenseSource, RealsenseSourceConfig
-from edge_unit.trust import tls_context
+from edge_unit.monitoring import clock_is_set, usb_cameras
+from edge_unit.sources import CameraInfo, DepthFrame, DepthSource
+from edge_unit.sources.realsense import capture_link as link
+from edge_unit.sources.realsense.capture_session import CaptureSession
+from edge_unit.sources.realsense.source import RealsenseSource, RealsenseSourceConfig
+from edge_unit.tls import tls_context
+from edge_unit.uplink.cell_cache import mesh_hashes
+from edge_unit.uplink.client import MasterClient
+from edge_unit.uplink.master_discovery import judged, kept_of, reach, wanted_of
+from edge_unit.uplink.master_selection import Place, choose, first_place
+from geometry.compilation.cache import PRIVATE, settle
 from shared.cell import Cell
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns, wall_ns
 from shared.discovery import Browser
@@ -341,7 +341,7 @@ async def _survey() -> link.Found:
 def _source(config: UnitConfig) -> tuple[DepthSource, Path]:
     """The source, and where compiled kernels are kept: that is settled before the first of them is imported."""
     settled = settle(config.jit_cache_dir)
-    from edge_unit.source_choice import make_source
+    from edge_unit.source_factory import make_source
 
     return make_source(config.source), settled
 
@@ -376,8 +376,8 @@ def _pipeline(
     settled: Path,
 ) -> Iterator[Finding]:
     """Kernels and what a frame costs, with the frames that were measured and a robot that stands elsewhere in each."""
-    from edge_unit.kernels.points import count_foreground
     from edge_unit.pipeline import DepthPipeline
+    from geometry.kernels.points import count_foreground
 
     if not measured.depth:
         return iter(())

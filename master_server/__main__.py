@@ -27,23 +27,21 @@ import uvicorn
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
-from master_server.access import Access, load_access
 from master_server.app import Application, add_viewer, make_app, make_replay_app
 from master_server.config import ENVIRONMENT_PREFIX, MasterConfig, ReplayConfig, ServerConfig
-from master_server.connections import Acceptor, GuardedHttp, fingerprint, quiet, server_context
-from master_server.limits import Limits
+from master_server.core import Master, Readable
 from master_server.logs import LogFormat, LogLevel, configure
-from master_server.master import Master
-from master_server.readable import Readable
-from master_server.recording import Recorder
-from master_server.replay import Replay
-from master_server.store import FILE_NAME, Store
-from master_server.timeline import Timeline, summary
-from master_server.tokens import Role, token_file, write_token
+from master_server.persistence import Store
+from master_server.persistence.store import FILE_NAME
+from master_server.recording.recorder import Recorder
+from master_server.recording.replay import Replay
+from master_server.recording.timeline import Timeline, summary
+from master_server.security import Access, Limits, Role, load_access, token_file, write_token
+from master_server.server.connection_guard import Acceptor, GuardedHttp, fingerprint, quiet, server_context
+from master_server.server.latest_only_websocket import SERVER_OPTIONS
 from master_server.viewer.host import is_installed
 from master_server.viewer.proxy import PAGE, Gate, link_path
 from master_server.viewer.sessions import LINK_S
-from master_server.websocket import SERVER_OPTIONS
 from shared.cell import Cell
 from shared.clock import monotonic_ns
 from shared.configuration import assignments, load

@@ -13,22 +13,20 @@ from fastapi.exceptions import RequestValidationError
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from master_server.access import Access
-from master_server.cell_loading import CellLoader
-from master_server.description import describe, illustrate, serve_documentation
-from master_server.history import History
-from master_server.limits import Limits
-from master_server.master import Master
-from master_server.metrics import VERSION, Metrics
-from master_server.pictures import Pictures
-from master_server.readable import Readable, ReadableCell
-from master_server.recording import Recorder
-from master_server.replay import Replay
-from master_server.routes import cell, health, images, map, recording, replay, robot, stream, units
-from master_server.routes.common import ip_of, log_refusal, refused
-from master_server.routes.replay import RefusedUpdate
-from master_server.routes.update import UpdateEndpoint
-from master_server.stream import Stream
+from master_server.api.history import History
+from master_server.api.image_requests import Pictures
+from master_server.api.map_stream import Stream
+from master_server.api.metrics import VERSION, Metrics
+from master_server.api.openapi import describe, illustrate, serve_documentation
+from master_server.api.routes import cell, health, images, map, recording, replay, robot, stream, units
+from master_server.api.routes.common import ip_of, log_refusal, refused
+from master_server.api.routes.replay import RefusedUpdate
+from master_server.api.routes.update import UpdateEndpoint
+from master_server.cells.cell_loading import CellLoader
+from master_server.core import Master, Readable, ReadableCell
+from master_server.recording.recorder import Recorder
+from master_server.recording.replay import Replay
+from master_server.security import Access, Limits
 from master_server.viewer import proxy
 from master_server.viewer.host import ViewerHost
 from master_server.viewer.proxy import Gate

@@ -9,8 +9,8 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from master_server.logs import LogFormat, LogLevel
-from master_server.recording import RecordingConfig
-from master_server.replay import SPEED_MAX, SPEED_MIN
+from master_server.recording.recorder import RecordingConfig
+from master_server.recording.replay import SPEED_MAX, SPEED_MIN
 from shared.settings import Settings
 
 ENVIRONMENT_PREFIX = "CELLWATCH_MASTER_"

@@ -96,7 +96,7 @@ def no_blocking_call(request: pytest.FixtureRequest) -> Iterator[None]:
     guard = BlockBuster(scanned_modules=[name for name in EVENT_LOOP_CODE if (CHECKOUT / name).is_dir()])
     for name, function in guard.functions.items():
         if name.startswith(("sqlite3.", "threading.Lock")):
-            function.can_block_in("master_server/store.py", STORE_BLOCKS)
+            function.can_block_in("master_server/persistence/store.py", STORE_BLOCKS)
     guard.activate()
     yield
     guard.deactivate()

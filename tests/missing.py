@@ -8,7 +8,7 @@ from typing import NoReturn
 
 import pytest
 
-from benchmarks.faulting.network import NAMESPACES, allowed
+from qualification.networks import NAMESPACES, allowed
 
 
 def missing(reason: str) -> NoReturn:

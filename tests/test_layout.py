@@ -12,14 +12,17 @@ from pathlib import Path
 import pytest
 
 CHECKOUT = Path(__file__).resolve().parent.parent
-PACKAGES = ("shared", "edge_unit", "master_server", "simulation", "benchmarks")
-FORBIDDEN = {  # package: the packages that it never imports
-    "shared": {"edge_unit", "master_server", "simulation", "benchmarks", "tests"},
-    "edge_unit": {"master_server", "benchmarks", "tests"},
-    "master_server": {"edge_unit", "benchmarks", "tests"},
-    "simulation": {"benchmarks", "tests"},
+PACKAGES = ("shared", "geometry", "edge_unit", "master_server", "simulation", "benchmarks", "qualification")
+WALLS = {  # package: the packages that it imports, and no others of the project
+    "shared": set(),
+    "geometry": {"shared"},
+    "edge_unit": {"shared", "geometry", "simulation"},
+    "master_server": {"shared"},
+    "simulation": {"shared", "geometry", "edge_unit"},
+    "benchmarks": {"shared", "geometry", "edge_unit", "master_server", "simulation"},
+    "qualification": {"shared", "geometry", "edge_unit", "master_server", "simulation", "benchmarks"},
 }
-KERNELS = ("edge_unit", "kernels")
+KERNELS = ("geometry", "kernels")
 KERNEL_IMPORTS = {"__future__", "collections", "math", "numba", "numpy", "typing"}
 CLOCK = ("shared", "clock")
 WALL_CLOCK_CALLS = {"now", "utcnow", "today"}
@@ -90,10 +93,10 @@ def check_order(root: Path) -> Iterator[str]:
 
 
 def check_packages(root: Path) -> Iterator[str]:
-    """Units and master never import each other; what both share imports neither."""
+    """Units and master never import each other, what both share imports neither, and no package a reader's."""
     for file, module in modules(root):
         for line, target in imports(file, module):
-            if target[0] in FORBIDDEN.get(module[0], ()):
+            if target[0] in {*PACKAGES, "tests"} - WALLS[module[0]] - {module[0]}:
                 yield f"{file.relative_to(root)}:{line}: {module[0]} imports {target[0]}"
 
 
@@ -150,12 +153,14 @@ BAD = {
     "shared/__init__.py": '"""Shared.\n\n    clock  time\n    cell   box\n    ghost  gone\n    clock  again\n"""',
     "shared/clock.py": "import time\nfrom . import cell",
     "shared/cell.py": "import edge_unit.config\nfrom shared.clock import now\nfrom datetime import datetime as d",
-    "edge_unit/__init__.py": '"""Unit.\n\n    config    what\n    kernels/  how\n    pipeline  all\n"""',
-    "edge_unit/config.py": "def f():\n    from edge_unit.kernels import project\n    from time import sleep",
-    "edge_unit/kernels/__init__.py": '"""Kernels.\n\n    project  rays\n    density  sums\n"""',
-    "edge_unit/kernels/project.py": "import numpy as np, math\nfrom edge_unit.kernels import density\nimport os.path",
-    "edge_unit/kernels/density.py": "import numba\nfrom . import project\nfrom ..pipeline import run",
-    "edge_unit/pipeline.py": "import edge_unit.kernels.density\nimport master_server.app\nx = datetime.datetime.now()",
+    "geometry/__init__.py": '"""Geometry.\n\n    config    what\n    kernels/  how\n    drawing   all\n"""',
+    "geometry/config.py": "def f():\n    from geometry.kernels import project\n    from time import sleep",
+    "geometry/kernels/__init__.py": '"""Kernels.\n\n    project  rays\n    density  sums\n"""',
+    "geometry/kernels/project.py": "import numpy as np, math\nfrom geometry.kernels import density\nimport os.path",
+    "geometry/kernels/density.py": "import numba\nfrom . import project\nfrom ..drawing import run",
+    "geometry/drawing.py": "import geometry.kernels.density",
+    "edge_unit/__init__.py": '"""Unit.\n\n    pipeline  all\n"""',
+    "edge_unit/pipeline.py": "import geometry.kernels.density\nimport master_server.app\nx = datetime.datetime.now()",
     "edge_unit/loose/part.py": "",
     "simulation/__init__.py": '"""Simulation."""',
     "simulation/world.py": "import edge_unit.pipeline",
@@ -171,20 +176,20 @@ EXPECTED: dict[Check, list[str]] = {
     ],
     check_order: [
         "shared/clock.py:2: imports shared.cell, which is listed below clock",
-        "edge_unit/config.py:2: imports edge_unit.kernels, which is listed below config",
-        "edge_unit/kernels/density.py:3: imports edge_unit.pipeline, which is listed below kernels",
-        "edge_unit/kernels/project.py:2: imports edge_unit.kernels.density, which is listed below project",
+        "geometry/config.py:2: imports geometry.kernels, which is listed below config",
+        "geometry/kernels/density.py:3: imports geometry.drawing, which is listed below kernels",
+        "geometry/kernels/project.py:2: imports geometry.kernels.density, which is listed below project",
     ],
     check_packages: [
         "shared/cell.py:1: shared imports edge_unit",
         "edge_unit/pipeline.py:2: edge_unit imports master_server",
     ],
     check_kernels: [
-        "edge_unit/kernels/density.py:3: a kernel imports edge_unit.pipeline.run",
-        "edge_unit/kernels/project.py:3: a kernel imports os.path",
+        "geometry/kernels/density.py:3: a kernel imports geometry.drawing.run",
+        "geometry/kernels/project.py:3: a kernel imports os.path",
     ],
     check_clock: [
-        "edge_unit/config.py:3: imports time",
+        "geometry/config.py:3: imports time",
         "edge_unit/pipeline.py:3: calls datetime.datetime.now",
     ],
     check_machine: ["notes.md:2: names /" + "home/a", "notes.md:3: names py" + "pi.org"],

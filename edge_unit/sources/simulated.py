@@ -31,11 +31,11 @@ from shared.transforms import Transform, from_xyz_rpy, identity
 from shared.waiting import within
 
 if TYPE_CHECKING:
-    from simulation.board_picture import BoardCamera
-    from simulation.camera import SimulatedCamera, SimulatedFrame
-    from simulation.handling import Handling, Hands
-    from simulation.truth import TruthFinder
-    from simulation.world import World
+    from simulation.cameras.board_picture import BoardCamera
+    from simulation.cameras.camera import SimulatedCamera, SimulatedFrame
+    from simulation.cameras.truth import TruthFinder
+    from simulation.world.handling import Handling, Hands
+    from simulation.world.world import World
 
 
 class SimulatedSourceConfig(BaseModel):
@@ -103,7 +103,7 @@ class SimulatedSource:
     """Renders a frame whenever one is due; a `DepthSource`.
 
     With `truth_path`, one msgpack map a frame is appended there: `captured_at_ns`, `frame_number`, `voxel_size_m`,
-    `visible_keys` and `visible_counts`, `surface_keys` (little-endian uint32 as bytes; see `simulation.truth`).
+    `visible_keys` and `visible_counts`, `surface_keys` (little-endian uint32 as bytes; see `simulation.cameras.truth`).
     """
 
     def __init__(self, config: SimulatedSourceConfig) -> None:
@@ -178,9 +178,9 @@ class SimulatedSource:
         """Build the world; imports the simulation, which a unit without it does not have."""
         config = self._config
         try:
-            from simulation.camera import d435i_intrinsics, rig
-            from simulation.handling import Hands
-            from simulation.world import World
+            from simulation.cameras.camera import d435i_intrinsics, rig
+            from simulation.world.handling import Hands
+            from simulation.world.world import World
         except ImportError as error:
             raise SourceError(
                 f"simulated camera: expected the simulation to be installed (pip install 'cellwatch[sim]'): {error}"
@@ -207,8 +207,8 @@ class SimulatedSource:
 
     def _hang(self, world: World, T_world_place: Transform, intrinsics: Intrinsics, handled: Handling) -> None:
         """Hang the camera where hands put it. The first frame compiles what is not in the cache yet."""
-        from simulation.camera import SimulatedCamera
-        from simulation.truth import TruthFinder
+        from simulation.cameras.camera import SimulatedCamera
+        from simulation.cameras.truth import TruthFinder
 
         config = self._config
         pose = T_world_place @ from_xyz_rpy(handled.xyz, np.radians(handled.rpy_deg))
@@ -221,7 +221,7 @@ class SimulatedSource:
         self._camera, self._handled, self._T_world_place = camera, handled, T_world_place
 
     def _board_camera(self, stream: ImageStream) -> BoardCamera:
-        from simulation.board_picture import BoardCamera
+        from simulation.cameras.board_picture import BoardCamera
 
         camera, config = self._camera, self._config
         assert camera is not None

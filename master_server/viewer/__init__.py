@@ -7,7 +7,7 @@ master alone. In the order of the flow:
 
     sessions   who may look, and who may change something: links that work once, and cookies
     channel    requests and answers between the master and that process
-    look       what one look at the master tells
+    snapshot   what one look at the master tells
     host       that process, started and served by the master
     proxy      the page and its socket as HTTP
     scene      the cell, drawn

@@ -19,13 +19,13 @@ from typing import Any
 import httpx
 from starlette.types import ASGIApp
 
-from master_server.access import Access
-from master_server.history import History
-from master_server.readable import Readable
-from master_server.replay import Replay
+from master_server.api.history import History
+from master_server.core import Readable
+from master_server.recording.replay import Replay
+from master_server.security import Access
 from master_server.viewer.channel import pack, receive
-from master_server.viewer.look import Wanted, look
 from master_server.viewer.sessions import Viewer
+from master_server.viewer.snapshot import Wanted, look
 from shared.clock import monotonic_ns
 from shared.errors import Refusal, WireError
 from shared.waiting import within

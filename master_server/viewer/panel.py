@@ -19,7 +19,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from master_server.history import SAMPLES_MAX, Sample
+from master_server.api.history import SAMPLES_MAX, Sample
 from master_server.viewer.channel import Asker
 from master_server.viewer.scene import (
     SHARED_COLOUR,

@@ -25,18 +25,10 @@ from starlette.responses import RedirectResponse
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
-from master_server.access import ANYONE
-from master_server.routes.common import (
-    OPERATOR_ONLY,
-    access_of,
-    ip_of,
-    limits_of,
-    log_refusal,
-    refused,
-    role_of,
-)
-from master_server.routes.sockets import serve
-from master_server.tokens import TOKEN_MAX_CHARS
+from master_server.api.routes.common import OPERATOR_ONLY, access_of, ip_of, limits_of, log_refusal, refused, role_of
+from master_server.api.routes.sockets import serve
+from master_server.security.auth import ANYONE
+from master_server.security.tokens import TOKEN_MAX_CHARS
 from master_server.viewer.host import ViewerHost
 from master_server.viewer.sessions import SESSION_S, SIGNED_WITH, Sessions, Viewer, viewer_of
 from shared.clock import monotonic_ns, wall_ns

@@ -14,8 +14,7 @@ import hmac
 import secrets
 from enum import Enum
 
-from master_server.access import Access
-from master_server.tokens import Role
+from master_server.security import Access, Role
 from shared.clock import NS_PER_S
 from shared.errors import Refusal
 

@@ -15,10 +15,10 @@ import numpy as np
 import viser
 
 from master_server.viewer.channel import Asker
-from master_server.viewer.look import Wanted
 from master_server.viewer.panel import Panel, Person, lattice_of
 from master_server.viewer.scene import Scene, Voxels
 from master_server.viewer.sessions import Viewer
+from master_server.viewer.snapshot import Wanted
 from shared.cell import Cell
 from shared.clock import NS_PER_S, monotonic_ns, wall_ns
 from shared.errors import CellwatchError, Refusal

@@ -12,20 +12,20 @@ import pytest
 from numpy.typing import NDArray
 
 from benchmarks import accuracy
-from benchmarks.judging import real
-from benchmarks.judging.curves import AXES, METRICS, Collection, Curve, worse
-from benchmarks.judging.plan import BASELINES, OURS, POINTS
-from benchmarks.judging.rules import Measured, MinimumPoints, Ours, Paper, Place, algorithm_1, algorithm_6, before
-from benchmarks.judging.stage import THINGS, Stage
-from benchmarks.judging.trials import Entry
-from benchmarks.judging.truth import TOOL_M, Judge, Surface, Tally, visible_pixels_min
-from benchmarks.plots import draw
+from benchmarks.ground_truth import real
+from benchmarks.ground_truth.curves import AXES, METRICS, Collection, Curve, worse
+from benchmarks.ground_truth.plan import BASELINES, OURS, POINTS
+from benchmarks.ground_truth.rules import Measured, MinimumPoints, Ours, Paper, Place, algorithm_1, algorithm_6, before
+from benchmarks.ground_truth.stage import THINGS, Stage
+from benchmarks.ground_truth.surface import TOOL_M, Judge, Surface, Tally, visible_pixels_min
+from benchmarks.ground_truth.trials import Entry
+from benchmarks.reporting.plots import draw
 from edge_unit.pipeline import DepthPipeline
 from shared.lattice import Lattice
 from shared.settings import FilterSettings
 from shared.transforms import apply, inverse
-from simulation.depth_noise import DepthNoise
-from simulation.scene import FIRST_UNKNOWN
+from simulation.cameras.depth_noise import DepthNoise
+from simulation.world.scene import FIRST_UNKNOWN
 
 Keys = NDArray[np.uint32]
 DISTANCE_M, BEHIND_M = 1.5, 1.0

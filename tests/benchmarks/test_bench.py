@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 from benchmarks.bench import run
-from benchmarks.parts import PARTS, Part
+from benchmarks.reporting.parts import PARTS, Part
 
 ROOT = Path(__file__).resolve().parents[2]
 
 WRITES = """
 import sys
 from pathlib import Path
-from benchmarks.report import write
+from benchmarks.reporting.report import write
 write("made", {"marks": []}, Path(sys.argv[1]))
 sys.exit(1)
 """

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from benchmarks.latency import STAGES, TO_MERGED, WHOLE, Case, main, result, timed
-from benchmarks.loading.map_readers import ASKING, LISTENING, Reading
-from benchmarks.timing.frames import RING_HZ, camera_phase_s, prepare
-from benchmarks.timing.unit import RingSource
+from benchmarks.latency_probe.frames import RING_HZ, camera_phase_s, prepare
+from benchmarks.latency_probe.unit import RingSource
+from benchmarks.load_generator.map_readers import ASKING, LISTENING, Reading
+from edge_unit.monitoring import TraceRecord
 from edge_unit.sources.simulated import SimulatedSourceConfig
-from edge_unit.trace import TraceRecord
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 
 MS = NS_PER_MS

@@ -11,7 +11,7 @@ from benchmarks import right_time
 from benchmarks.joint_delivery import Delivered
 from benchmarks.right_time import UNTOLD, deliveries, paths, result, watch
 from shared.settings import Settings
-from simulation.camera import d435i_intrinsics
+from simulation.cameras.camera import d435i_intrinsics
 
 FRAMES = 16
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.loading.map_readers import Reading
-from benchmarks.loading.merge_costs import merge_costs
-from benchmarks.loading.scale_load import Step
+from benchmarks.load_generator.map_readers import Reading
+from benchmarks.load_generator.merge_costs import merge_costs
+from benchmarks.load_generator.scale_load import Step
 from benchmarks.scale import Ages, Row, ages, cpu_fit, load_result, main
 from shared.clock import NS_PER_MS
 

@@ -13,15 +13,15 @@ import pytest
 from scipy import ndimage
 
 from benchmarks import sweeps
-from benchmarks.report import Mark, Result
-from benchmarks.sweeping import shapes
-from benchmarks.sweeping.stage import Stage, reported_at
+from benchmarks.reporting.report import Mark, Result
+from benchmarks.sweep_scenes import shapes
+from benchmarks.sweep_scenes.stage import Stage, reported_at
 from benchmarks.sweeps import Amount, quick
 from shared.meshes import box_mesh
 from shared.settings import FilterSettings
 from shared.transforms import from_rotation_translation
-from simulation.depth_noise import DepthNoise
-from simulation.scene import Body, Owner
+from simulation.cameras.depth_noise import DepthNoise
+from simulation.world.scene import Body, Owner
 
 LITTLE = replace(quick(), boxes=25, curve_boxes=8, plate_step_m=0.025, rods=25, speckles=20, moments=2)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.booting.machines import why_not
+from qualification.machines.containers import why_not
 
 CHECKOUT = Path(__file__).parents[2]
 

@@ -16,7 +16,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from benchmarks.booting.machines import Machine, MachineError, make_network, until
+from qualification.machines.containers import Machine, MachineError, make_network, until
 
 CHECKOUT = Path(__file__).parents[2]
 BOOT_S = 180.0

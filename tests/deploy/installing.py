@@ -17,7 +17,7 @@ from typing import Any
 
 import httpx
 
-from benchmarks.booting.machines import Machine, MachineError, make_network, until
+from qualification.machines.containers import Machine, MachineError, make_network, until
 
 CHECKOUT = Path(__file__).parents[2]
 IP = "10.77.0.1"

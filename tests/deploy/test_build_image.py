@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.booting.machines import NAMESPACES
+from qualification.machines.containers import NAMESPACES
 
 CHECKOUT = Path(__file__).parents[2]
 TOOLS = ("sfdisk", "mke2fs", "resize2fs", "unzip", "zstd", "losetup")

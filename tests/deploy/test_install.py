@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.booting.machines import NAMESPACES
+from qualification.machines.containers import NAMESPACES
 
 CHECKOUT = Path(__file__).parents[2]
 

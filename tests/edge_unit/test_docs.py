@@ -9,7 +9,7 @@ import pytest
 from pydantic import BaseModel
 
 from edge_unit.config import UnitConfig
-from edge_unit.sources.realsense import RealsenseSourceConfig
+from edge_unit.sources.realsense.source import RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSourceConfig
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from master_server.config import MasterConfig

@@ -14,11 +14,11 @@ from edge_unit import __main__ as command_line
 from edge_unit import doctor
 from edge_unit.config import UnitConfig
 from edge_unit.doctor import Finding, Measured, examine
-from edge_unit.sources.frame import CameraInfo
-from edge_unit.sources.realsense import RealsenseSourceConfig
+from edge_unit.sources import CameraInfo
+from edge_unit.sources.realsense.source import RealsenseSourceConfig
 from shared.camera import Intrinsics
 from shared.clock import NS_PER_S
-from tests.edge_unit.sources import recordings
+from tests.edge_unit.sources.realsense import recordings
 
 INFO = CameraInfo("1", "D435", Intrinsics(64, 48, 60.0, 60.0, 31.5, 23.5))
 NO_MASTER = "http://127.0.0.1:9"

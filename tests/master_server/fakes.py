@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from master_server.master import Master
+from master_server.core import Master
 from shared.camera import Intrinsics
 from shared.cell import Cell
 from shared.kinematics import DHJoint, Robot

@@ -14,12 +14,12 @@ import msgpack
 import numpy as np
 import pytest
 
-from master_server.access import Access
-from master_server.answers import CoverageAnswer
+from master_server.api.metrics import VERSION
+from master_server.api.responses import CoverageAnswer
+from master_server.api.routes import common
 from master_server.app import make_app
-from master_server.metrics import VERSION
-from master_server.recording import Recorder, RecordingConfig
-from master_server.routes import common
+from master_server.recording.recorder import Recorder, RecordingConfig
+from master_server.security import Access
 from shared.clock import monotonic_ns
 from shared.messages import InitializeAnswer, RobotAnswer, UnitRow, VoxelsAnswer
 from shared.settings import Settings

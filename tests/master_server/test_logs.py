@@ -52,7 +52,7 @@ def test_a_line_of_json_tells_who_and_what(configured: Configure) -> None:
     ]  # fmt: skip
     last = lines[-1]
     assert (last["level"], last["logger"], last["unit_id"], last["ip"]) == (
-        "WARNING", "master_server.registry", 1, "10.0.0.1",
+        "WARNING", "master_server.core.units", 1, "10.0.0.1",
     )  # fmt: skip
     assert last["message"] == f"unit 1 (10.0.0.1): live → stale: {last['reason']}"
     assert last["time"].endswith("+00:00")

@@ -8,10 +8,10 @@ import sys
 from pathlib import Path
 
 from edge_unit.config import UnitConfig
-from edge_unit.sources.realsense import RealsenseSource, RealsenseSourceConfig
-from edge_unit.unit import Unit
+from edge_unit.daemon.unit import Unit
+from edge_unit.sources.realsense.source import RealsenseSource, RealsenseSourceConfig
 from shared.configuration import load
-from simulation.pluggable import command
+from simulation.cameras.pluggable import command
 
 if __name__ == "__main__":
     sockets, path = map(Path, sys.argv[1:])

@@ -15,7 +15,7 @@ import httpx
 import psutil
 import pytest
 
-from benchmarks.loading.load import Plan
+from benchmarks.load_generator.load import Plan
 from tests.system.bad_peers import BadPeers
 from tests.system.cluster import Cluster, write_cell
 
@@ -47,7 +47,7 @@ def begin_unit(cluster: Cluster, name: str) -> subprocess.Popen[str]:
     )  # fmt: skip
     path = cluster.folder / f"{name}.plan.json"
     path.write_text(json.dumps(asdict(plan)))
-    return cluster.start(name, "benchmarks.loading.load", str(path), str(cluster.folder / f"{name}.json"))
+    return cluster.start(name, "benchmarks.load_generator.load", str(path), str(cluster.folder / f"{name}.json"))
 
 
 def result(cluster: Cluster, name: str, process: subprocess.Popen[str]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_unit.client import MasterClient
+from edge_unit.uplink.client import MasterClient
 from shared.camera import Intrinsics
 from shared.clock import monotonic_ns
 from shared.messages import CONTRACT_VERSION, Health, InitializeRequest, UpdateRequest

@@ -68,7 +68,7 @@ class RunningDemo:
             assert time.monotonic() < deadline, self.children
             time.sleep(0.05)
             found = psutil.Process(self.process.pid).children(recursive=True)
-            self.children = [child for child in found if "simulation.warm_up" not in child.cmdline()]
+            self.children = [child for child in found if "simulation.fleet.warm_up" not in child.cmdline()]
 
     def end(self, number: signal.Signals | None = None) -> tuple[int, float]:
         """Send a signal, if any; exit code and seconds until it had ended."""

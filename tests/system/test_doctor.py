@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.edge_unit.sources import recordings
+from tests.edge_unit.sources.realsense import recordings
 from tests.system.cluster import Cluster, write_cell
 
 

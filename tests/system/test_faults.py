@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from benchmarks.faulting.watch import NOTICED_S_MAX, RECOVERED_S_MAX
-from benchmarks.faults import FAULTS
+from qualification.fault_site.watch import NOTICED_S_MAX, RECOVERED_S_MAX
+from qualification.faults import FAULTS
 from tests.missing import need_namespaces
 
 pytestmark = pytest.mark.slow
@@ -27,7 +27,7 @@ def namespaces() -> None:
 
 def struck(name: str) -> dict[str, Any]:
     """The row of one fault."""
-    command = (sys.executable, "-m", "benchmarks.faults", name)
+    command = (sys.executable, "-m", "qualification.faults", name)
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.stdout, run.stderr
     (row,) = json.loads(run.stdout.splitlines()[-1])["faults"]

@@ -12,8 +12,9 @@ from typing import Any
 
 import pytest
 
-from master_server.store import FILE_NAME, TRY_EVERY_S, Store
-from master_server.tokens import Role, write_token
+from master_server.persistence import Store
+from master_server.persistence.store import FILE_NAME, TRY_EVERY_S
+from master_server.security import Role, write_token
 from shared.errors import ConfigError
 from shared.waiting import within
 from tests.master_server.fakes import AT_ORIGIN

@@ -40,7 +40,7 @@ def test_no_line_holds_a_token(tmp_path: Path, level: str) -> None:
         assert token not in log
     lines = [json.loads(line) for line in log.splitlines() if not line.startswith("master-server: ")]
     assert all({"time", "level", "logger", "message"} <= line.keys() for line in lines)
-    assert {"uvicorn.error", "master_server.routes.stream"} <= {line["logger"] for line in lines}
+    assert {"uvicorn.error", "master_server.api.routes.stream"} <= {line["logger"] for line in lines}
     refusals = [line for line in lines if line.get("event") == "refusal"]
     assert {(line["ip"], line["status"]) for line in refusals} >= {("127.0.0.1", 400), ("127.0.0.1", 401)}
     assert any("POST /update from 127.0.0.1 refused: 422" in line["message"] for line in refusals)

@@ -19,7 +19,8 @@ import httpx
 import pytest
 import yaml
 
-from master_server.store import FILE_NAME, Store
+from master_server.persistence import Store
+from master_server.persistence.store import FILE_NAME
 from shared.clock import monotonic_ns
 from shared.messages import InitializeAnswer
 from shared.waiting import within
@@ -38,7 +39,7 @@ STAY = 3
 WRITER = """
 import sys, threading
 from pathlib import Path
-from master_server.store import Store, UnitRecord
+from master_server.persistence.store import Store, UnitRecord
 from shared.messages import Versions
 from shared.settings import Settings
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.plug_and_play import FIRST_VOXEL_S_MAX, NOTICE_S_MAX, POSE_DEG_MAX, POSE_MM_MAX, ROBOT_PERCENT_MAX
+from qualification.plug_and_play import FIRST_VOXEL_S_MAX, NOTICE_S_MAX, POSE_DEG_MAX, POSE_MM_MAX, ROBOT_PERCENT_MAX
 from tests.missing import need_namespaces
 
 pytestmark = pytest.mark.slow
@@ -25,7 +25,7 @@ BUSY_START = 5.0
 @pytest.fixture(scope="module")
 def played() -> dict[str, Any]:
     need_namespaces()
-    command = (sys.executable, "-m", "benchmarks.plug_and_play", "--quiet-seconds", "6")
+    command = (sys.executable, "-m", "qualification.plug_and_play", "--quiet-seconds", "6")
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.stdout, run.stderr
     return dict(json.loads(run.stdout.splitlines()[-1]))

@@ -13,8 +13,8 @@ from typing import Any
 import psutil
 import pytest
 
-from simulation.pluggable import plug
-from tests.edge_unit.sources import recordings
+from simulation.cameras.pluggable import plug
+from tests.edge_unit.sources.realsense import recordings
 from tests.system.cluster import Cluster, until, write_cell
 
 NOTICED_S = 1.0

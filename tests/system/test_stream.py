@@ -15,7 +15,7 @@ import psutil
 import pytest
 from websockets.asyncio.client import ClientConnection, connect
 
-from master_server.answers import StreamMessage
+from master_server.api.responses import StreamMessage
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.messages import InitializeAnswer, UpdateRequest
 from shared.timebase import Exchange

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from edge_unit.trace import read_trace
+from edge_unit.monitoring import read_trace
 from shared.lattice import Lattice
 from tests.system.cluster import STOP_S, Cluster, stop, until, write_cell, write_recording
 

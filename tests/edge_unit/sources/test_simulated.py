@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from edge_unit.sources.frame import DepthFrame, DepthSource
+from edge_unit.sources import DepthFrame, DepthSource
 from edge_unit.sources.simulated import SimulatedSource, SimulatedSourceConfig
 from shared.cell import Cell
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import SourceError
 from shared.transforms import from_xyz_rpy
-from simulation.camera import SimulatedCamera, d435i_intrinsics, rig
-from simulation.handling import LEFT_ALONE, Handling
-from simulation.truth import TruthFinder
-from simulation.world import DEMO_CELL, World
+from simulation.cameras.camera import SimulatedCamera, d435i_intrinsics, rig
+from simulation.cameras.truth import TruthFinder
+from simulation.world.handling import LEFT_ALONE, Handling
+from simulation.world.world import DEMO_CELL, World
 
 WAIT_S = 20.0
 """Kernels may have to be compiled first."""
@@ -149,7 +149,7 @@ async def test_what_cannot_be_simulated_is_one_clear_error(settings: dict[str, o
 
 
 async def test_without_the_simulation_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "simulation.camera", None)
+    monkeypatch.setitem(sys.modules, "simulation.cameras.camera", None)
     with pytest.raises(SourceError, match=r"pip install 'cellwatch\[sim\]'"):
         await asyncio.wait_for(SimulatedSource(SimulatedSourceConfig()).open(), WAIT_S)
 

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`python -m benchmarks.latency_probe.unit CONFIG.YAML`: the edge unit before a camera that plays prepared frames.
+
+All but the source is the daemon as it is installed. The frames are those of `frames`, in the file that the
+`handling` of its simulated camera names; a frame counts as taken at the moment at which it falls due.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import AsyncGenerator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import edge_unit.source_factory
+from benchmarks.latency_probe.frames import RING_HZ, camera_phase_s
+from edge_unit.__main__ import main
+from edge_unit.config import SourceConfig
+from edge_unit.sources import CameraInfo, DepthFrame, DepthSource
+from edge_unit.sources.simulated import SimulatedSourceConfig
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.errors import SourceError
+from simulation.cameras.camera import d435i_intrinsics, rig
+from simulation.world.world import World
+
+
+class RingSource:
+    """Plays a ring of frames at the pace of the configuration, from the epoch on; a `DepthSource`."""
+
+    def __init__(self, config: SimulatedSourceConfig, ring: Path) -> None:
+        self._config = config
+        self._ring = ring
+        self._frames: NDArray[np.uint16] | None = None
+
+    async def open(self) -> CameraInfo:
+        """See `DepthSource`."""
+        # All of it in memory: a disk would be measured with it.
+        self._frames = await asyncio.to_thread(np.load, self._ring)
+        config = self._config
+        pose = rig(World.demo(people=0).cell, config.cameras)[config.camera]
+        return CameraInfo(config.serial, "Played D435i", d435i_intrinsics(config.width, config.height), pose)
+
+    async def frames(self) -> AsyncGenerator[DepthFrame, None]:
+        """See `DepthSource`. Who is slow skips."""
+        frames, config = self._frames, self._config
+        if frames is None:
+            raise SourceError("played camera: expected to be opened before its frames are read")
+        period_ns = round(NS_PER_S / config.fps)
+        stride = round(RING_HZ / config.fps)
+        first_ns = config.epoch_ns + round(camera_phase_s(config.camera, config.cameras) * NS_PER_S)
+        last = -1
+        while True:
+            latest = (monotonic_ns() - first_ns) // period_ns
+            # The one that was taken while the reader was busy, or else the next.
+            last = latest if latest > last >= 0 else max(latest, last) + 1
+            due_ns = first_ns + last * period_ns
+            await asyncio.sleep(max(due_ns - monotonic_ns(), 0) / NS_PER_S)
+            yield DepthFrame(frames[last * stride % len(frames)], due_ns, last)
+
+    async def close(self) -> None:
+        """See `DepthSource`."""
+        self._frames = None
+
+
+def make_source(config: SourceConfig) -> DepthSource:
+    """The source of a configuration whose kind is `simulated`."""
+    assert isinstance(config, SimulatedSourceConfig)
+    assert config.handling is not None
+    return RingSource(config, config.handling)
+
+
+if __name__ == "__main__":
+    edge_unit.source_factory.make_source = make_source
+    sys.exit(main(["run", *sys.argv[1:], "--log-level", "WARNING"]))

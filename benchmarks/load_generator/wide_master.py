@@ -1,0 +1,14 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`python -m benchmarks.load_generator.wide_master`: a master that takes more units than it should."""
+
+from __future__ import annotations
+
+import sys
+
+import master_server.core.units
+from master_server.__main__ import main
+from master_server.core.merged_map import MAX_WITNESSES
+
+if __name__ == "__main__":
+    master_server.core.units.MAX_UNITS = MAX_WITNESSES
+    sys.exit(main())

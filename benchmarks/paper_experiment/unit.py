@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One unit as a process: is told which frame it sees, filters it, and reports it by the units' own client."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.paper_experiment.contenders import UnitWork
+from benchmarks.paper_experiment.master import Member
+from benchmarks.peers.ur3_scene import room
+from edge_unit.pipeline import DepthPipeline
+from shared.camera import Intrinsics
+from shared.cell import Cell
+from shared.clock import monotonic_ns
+from shared.transforms import Transform
+from simulation.fleet.processes import die_with_parent
+
+
+@dataclass(frozen=True, eq=False)
+class Watch:
+    """Go on with another camera: `frames` is an npy file of (N, H, W) uint16, `joints` (N, n) rad are theirs."""
+
+    intrinsics: Intrinsics
+    T_world_camera: Transform
+    frames: Path
+    joints: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Resize:
+    """Go on with voxels of another size, and register anew."""
+
+    voxel_size_m: float
+
+
+@dataclass(frozen=True)
+class Look:
+    """Filter frame `number` and report it; None: report that nothing unknown is there."""
+
+    number: int | None
+
+
+Order = Watch | Resize | Look | None
+"""What a unit is told to do; it says True when that is done. None: come to an end."""
+
+
+def run(orders: Connection, url: str, token: str, number: int) -> None:
+    """Do what is asked until told to end."""
+    die_with_parent()
+    asyncio.run(_Unit(orders, Member.at(url, token, number)).run())
+
+
+class _Unit:
+    def __init__(self, orders: Connection, member: Member) -> None:
+        self._orders, self._member = orders, member
+        self._cell: Cell = room()
+
+    async def run(self) -> None:
+        async with self._member.client:
+            # Nothing else waits for this loop: it may stand still until there is something to do.
+            while (order := self._orders.recv()) is not None:
+                await self._obey(order)
+                self._orders.send(True)
+
+    async def _obey(self, order: Watch | Resize | Look) -> None:
+        if isinstance(order, Watch):
+            self._watch, self._depth = order, np.load(order.frames)
+            self._work = UnitWork(DepthPipeline(order.intrinsics, order.T_world_camera, self._cell))
+        elif isinstance(order, Resize):
+            self._work.resize(order.voxel_size_m)
+            await self._member.register(self._watch.intrinsics, self._watch.T_world_camera)
+            # Compiles what is not yet, and leaves the connection open.
+            self._work.look(self._depth[0], self._watch.joints[0])
+            await self._member.tell(None, monotonic_ns())
+        elif order.number is None:
+            await self._member.tell(None, monotonic_ns())
+        else:
+            captured_at_ns, n = monotonic_ns(), order.number
+            await self._member.tell(self._work.look(self._depth[n], self._watch.joints[n]), captured_at_ns)

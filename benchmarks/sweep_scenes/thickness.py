@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How thin a thing on a table may be before it is lost in the table's margin.
+
+A box of 10 x 10 cm, at another place and turned another way in each frame, on a table that fills the picture of a
+camera straight above. The table is in CAD, or learned.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from benchmarks.reporting.report import Mark, Result
+from benchmarks.sweep_scenes.stage import Stage, reported_at
+from edge_unit.pipeline import DepthPipeline
+from shared.meshes import TriangleMesh, box_mesh
+from shared.settings import FilterSettings
+from shared.transforms import from_xyz_rpy
+from simulation.cameras.depth_noise import DepthNoise
+from simulation.world.scene import Body, Owner
+
+SIDE_M = 0.10
+"""A hand, or a tool left behind."""
+
+PLACES_M = 0.25
+"""Boxes stand within this of the optical axis: inside the picture at half a metre."""
+
+MARKED = ((1.0, 0.070), (2.0, 0.130))
+"""Distance of the table, height of a box that must be reported there."""
+
+REPORTED_SHARE = 0.99
+EMPTY_SHARE_MAX = 0.005
+
+STEP_M = 0.005
+"""Heights are tried in these steps."""
+
+HIGHEST_M, CLEARANCE_M = 0.6, 0.25
+"""The highest box that is tried, and how far below the camera it must end: nearer than 0.2 m nothing is measured."""
+
+LEARNED_FRAMES = 60
+"""Two seconds of the empty table."""
+
+SHIFTS = 5
+"""The lattice begins at this many heights relative to the table's top."""
+
+
+class Trial:
+    """Boxes on a table at one distance, before one filter."""
+
+    def __init__(self, distance_m: float, cad: bool, settings: FilterSettings, seed: int) -> None:
+        self._stage = Stage(distance_m, DepthNoise(), seed)
+        shifts_m = [settings.voxel_size_m * k / SHIFTS for k in range(SHIFTS)]
+        self._pipelines: list[DepthPipeline] = [self._stage.pipeline(settings, shift, cad) for shift in shifts_m]
+        self._seed = seed
+        if not cad:
+            reference = self._pipelines[0].learn((self._stage.frame(), None) for _ in range(LEARNED_FRAMES))
+            for pipeline in self._pipelines:
+                pipeline.use(reference)
+
+    def reported_share(self, height_m: float, frames: int) -> float:
+        """Share of the frames in which a box of `height_m` is reported."""
+        rng = np.random.default_rng((self._seed, round(height_m * 1e4)))
+        mesh = _box(height_m)
+        found = 0
+        for i in range(frames):
+            x, y = rng.uniform(-PLACES_M, PLACES_M, 2)
+            pose = from_xyz_rpy((x, y, 0.5 * height_m), (0.0, 0.0, rng.uniform(0.0, math.pi)))
+            body = Body("box", mesh, pose, Owner.UNKNOWN)
+            found += reported_at(self._pipelines[i % SHIFTS].process(self._stage.frame(body), None), body)
+        return found / frames
+
+    def empty_share(self, frames: int) -> float:
+        """Share of the frames of the empty table in which anything is reported."""
+        found = sum(len(self._pipelines[i % SHIFTS].process(self._stage.frame(), None)) > 0 for i in range(frames))
+        return found / frames
+
+    def thinnest_m(self, frames: int) -> float:
+        """The thinnest box, in whole steps, that is reported often enough; NaN when not even the highest is."""
+        highest_m = min(HIGHEST_M, self._stage.height_m - CLEARANCE_M)
+        lost, kept = 0, round(highest_m / STEP_M)
+        if self.reported_share(kept * STEP_M, frames) < REPORTED_SHARE:
+            return math.nan
+        while kept - lost > 1:
+            middle = (lost + kept) // 2
+            if self.reported_share(middle * STEP_M, frames) >= REPORTED_SHARE:
+                kept = middle
+            else:
+                lost = middle
+        return kept * STEP_M
+
+
+@dataclass(frozen=True)
+class AtMark:
+    """What came of boxes of one height: shares of the frames with a box, and of those without."""
+
+    distance_m: float
+    height_m: float
+    cad: bool
+    frames: int
+    reported_share: float
+    empty_share: float
+
+
+def trial(distance_m: float, height_m: float, cad: bool, frames: int, settings: FilterSettings) -> AtMark:
+    """Boxes of one height on one table."""
+    boxes = Trial(distance_m, cad, settings, seed=1)
+    reported = boxes.reported_share(height_m, frames)
+    return AtMark(distance_m, height_m, cad, frames, reported, boxes.empty_share(frames))
+
+
+def at_the_marks(found: list[AtMark]) -> Result:
+    """The table, and the marks of those on CAD; a box is no feat where the empty table is reported, too."""
+    rows = tuple(
+        (_KIND[each.cad], each.distance_m, 1e3 * each.height_m, each.frames, *_percents(each)) for each in found
+    )
+    marks = []
+    for each in found:
+        name = f"{1e3 * each.height_m:.0f} mm on a {_KIND[each.cad]} table at {each.distance_m:g} m"
+        reported, empty = _percents(each)
+        marks.append(Mark(f"{name}: reported in % of frames", reported, at_least=100.0 * REPORTED_SHARE))
+        marks.append(Mark(f"{name}: empty table reported in % of frames", empty, at_most=100.0 * EMPTY_SHARE_MAX))
+    columns = ("table", "distance m", "height mm", "frames", "reported %", "empty table reported %")
+    return Result("Thickness: boxes of 10 x 10 cm on a table", columns, rows, tuple(marks))
+
+
+def point(distance_m: float, frames: int, settings: FilterSettings) -> tuple[float, float, float]:
+    """Distance in metres; in mm the thinnest box that is reported, on a CAD table and on a learned one."""
+    cad, learned = (Trial(distance_m, kind, settings, seed=2).thinnest_m(frames) for kind in (True, False))
+    return distance_m, 1e3 * cad, 1e3 * learned
+
+
+def curve(points: list[tuple[float, float, float]], frames: int) -> Result:
+    """The thinnest boxes as a table."""
+    return Result(
+        f"Thinnest box of 10 x 10 cm that is reported in at least 99 % of {frames} frames",
+        ("distance m", "on a CAD table mm", "on a learned table mm"),
+        tuple(points),
+    )
+
+
+def _percents(each: AtMark) -> tuple[float, float]:
+    return 100.0 * each.reported_share, 100.0 * each.empty_share
+
+
+_KIND = {True: "CAD", False: "learned"}
+
+
+@cache
+def _box(height_m: float) -> TriangleMesh:
+    return box_mesh("box", (SIDE_M, SIDE_M, height_m))

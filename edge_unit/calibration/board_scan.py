@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Looks for the board through a source's own pictures: once when asked, or for ever, ever less often."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from contextlib import aclosing
+
+from edge_unit.calibration.board_pose import BoardLocaliser, Localisation
+from edge_unit.sources.image import ImageStream, LooksAtBoard
+from shared.cell import Board
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.errors import BoardError, SourceError
+
+FRAMES = 20
+"""Of which most show the board: a mean of these is as good as one of more, for what they share does not average out."""
+
+GOOD_FRAMES = 8
+GOOD_MM, GOOD_DEG = 5.0, 0.1
+"""So many that agree on a pose known this well are enough: no margin of the filter is that narrow."""
+
+EMPTY_FRAMES = 15
+"""With no marker at all in so many pictures there is no board; one may be hidden by somebody who passes."""
+
+MAX_LOOK_S = 20.0
+"""For pictures that show some of it; then what there is must do."""
+
+RETRY_MIN_S = 2.0
+RETRY_MAX_S = 30.0
+"""Between looks: whoever mounts a board waits no longer, and depth is interrupted no more often."""
+
+
+class BoardSearch:
+    """One unit's search for its cell's board."""
+
+    def __init__(self, source: object, stream: ImageStream) -> None:
+        """A `source` that does not `LooksAtBoard` has no pictures to look at."""
+        self._source = source
+        self._stream: ImageStream = stream
+        self._retry_s = RETRY_MIN_S
+        self._next_ns = 0
+        self.outcome = ""
+
+    @property
+    def possible(self) -> bool:
+        """Whether the source has pictures of the board at all."""
+        return isinstance(self._source, LooksAtBoard)
+
+    def due(self, now_ns: int) -> bool:
+        """Whether to look again, after what was found before."""
+        return self.possible and now_ns >= self._next_ns
+
+    def begin_anew(self) -> None:
+        """Look at once, and often again."""
+        self._next_ns, self._retry_s = 0, RETRY_MIN_S
+
+    async def look(self, board: Board, tell: Callable[[str], None]) -> Localisation:
+        """Look at pictures until they tell the pose or are not going to; `tell` is told what is seen meanwhile.
+
+        Raises:
+            BoardError: they do not tell it; one sentence that says what to do.
+            CellError: OpenCV has no such board.
+            SourceError: the camera delivers no pictures.
+        """
+        source = self._source
+        if not isinstance(source, LooksAtBoard):
+            raise BoardError("this unit's source has no pictures in which to look for the board")
+        begun_ns = monotonic_ns()
+        try:
+            async with source.look(self._stream) as look:
+                info = look.info
+                localiser = BoardLocaliser(
+                    board, info.intrinsics, info.distortion, info.T_depth_image, info.distortion_model
+                )
+                seen, empty = 0, 0
+                async with aclosing(look.images()) as images:
+                    async for image in images:
+                        sighting = await asyncio.to_thread(localiser.add, image.pixels.copy())
+                        tell(f"looking for the board: {localiser.now}")
+                        seen += 1
+                        empty = 0 if sighting.detection.markers else empty + 1
+                        late = monotonic_ns() - begun_ns > MAX_LOOK_S * NS_PER_S
+                        if late or empty >= EMPTY_FRAMES or localiser.frames_with_pose >= FRAMES:
+                            break
+                        if await asyncio.to_thread(_is_good, localiser):
+                            break
+                if not seen:
+                    raise SourceError("the camera delivered no picture to look for the board in")
+                found = await asyncio.to_thread(localiser.result)
+        except (BoardError, SourceError) as error:
+            self.outcome = str(error)
+            self._next_ns = monotonic_ns() + round(self._retry_s * NS_PER_S)
+            self._retry_s = min(2.0 * self._retry_s, RETRY_MAX_S)
+            raise
+        self.outcome = ""
+        self.begin_anew()
+        return found
+
+
+def _is_good(localiser: BoardLocaliser) -> bool:
+    """Whether the pose is known so well that more pictures are not worth the time."""
+    if localiser.frames_with_pose < GOOD_FRAMES:
+        return False
+    try:
+        found = localiser.result()
+    except BoardError:
+        return False
+    return found.uncertainty_mm <= GOOD_MM and found.uncertainty_deg <= GOOD_DEG

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The camera's pose by the board, found through the source's own pictures and told to the master."""
+
+from __future__ import annotations
+
+import logging
+
+from edge_unit.calibration.board_layout import require_board
+from edge_unit.calibration.board_scan import BoardSearch
+from edge_unit.daemon.report import troubled
+from edge_unit.sources import DepthFrame
+from edge_unit.uplink.uplink import Assignment, Uplink
+from shared.errors import CellwatchError
+from shared.messages import DONE, PoseQuality
+
+logger = logging.getLogger(__name__)
+
+
+async def localise(search: BoardSearch, uplink: Uplink, assignment: Assignment, frame: DepthFrame) -> str:
+    """Look for the board while depth pauses, and tell the master the pose; returns what came of it.
+
+    `frame` is the last one before the look: what is seen meanwhile is told as its trouble.
+    """
+
+    def tell(seen: str) -> None:
+        uplink.offer(troubled(assignment, frame, seen))
+
+    first = not search.outcome
+    try:
+        found = await search.look(require_board(assignment.cell.board), tell)
+        quality = PoseQuality(
+            uncertainty_mm=round(found.uncertainty_mm, 3),
+            uncertainty_deg=round(found.uncertainty_deg, 4),
+            reprojection_px=round(found.reprojection_px, 4),
+        )
+        await uplink.tell_pose(found.T_world_camera, "board", quality)
+    except CellwatchError as error:
+        # It looks for ever, but says so once.
+        logger.log(logging.WARNING if first else logging.DEBUG, "%s", error)
+        tell(f"looking for the board: {error}")
+        return str(error)
+    logger.info(
+        "found the board in %d of %d pictures: the pose is known to %.1f mm and %.2f degrees",
+        found.frames_used,
+        found.frames_seen,
+        found.uncertainty_mm,
+        found.uncertainty_deg,
+    )
+    return DONE

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Everything about a frame that takes time, in a thread while the event loop talks to the master."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable
+
+from edge_unit.daemon.background_learning import Learning
+from edge_unit.daemon.joint_lookup import FrameJoints, known
+from edge_unit.daemon.pipeline_manager import AssignedPipeline
+from edge_unit.daemon.refinement_task import Refining
+from edge_unit.daemon.report import health_of, troubled, within_bounds
+from edge_unit.joints import JointEstimate
+from edge_unit.monitoring import Stages, Stance
+from edge_unit.pipeline import DepthPipeline
+from edge_unit.sources import DepthFrame
+from edge_unit.uplink.uplink import Assignment, Report
+from shared.errors import InputError
+from shared.messages import Command
+from shared.transforms import Transform
+from shared.wire import keys_to_bytes
+
+logger = logging.getLogger(__name__)
+
+
+class FrameWork:
+    """From a frame to its report. Not for use from several threads at once."""
+
+    def __init__(
+        self,
+        finish: Callable[[Command, str], None],
+        assigned: AssignedPipeline,
+        learning: Learning,
+        refining: Refining,
+        stance: Stance,
+        joints: FrameJoints,
+    ) -> None:
+        """`finish` is told what became of a command."""
+        self._finish = finish
+        self._assigned = assigned
+        self._learning = learning
+        self._refining = refining
+        self._stance = stance
+        self._joints = joints
+
+    def process(
+        self,
+        assignment: Assignment,
+        T_world_camera: Transform,
+        frame: DepthFrame,
+        joints: JointEstimate | None,
+        changes: Iterable[Command],
+        stages: Stages,
+    ) -> Report:
+        """What `frame` shows with all that was assigned and asked for; what cannot be done is the report's trouble."""
+        try:
+            pipeline = self._prepare(assignment, T_world_camera, changes)
+            untold = self._learning.add(pipeline, self._assigned.place, frame.depth, joints)
+            if untold is not None:
+                return troubled(assignment, frame, untold)
+            return self._report(pipeline, assignment, frame, joints, stages)
+        except InputError as error:
+            logger.warning("frame %d: %s", frame.frame_number, error)
+            return troubled(assignment, frame, str(error))
+
+    def _prepare(self, assignment: Assignment, T_world_camera: Transform, changes: Iterable[Command]) -> DepthPipeline:
+        """The pipeline as assignment and commands have it; without one, nothing can be changed."""
+        try:
+            pipeline = self._assigned.prepare(assignment, T_world_camera)
+        except InputError as error:
+            for command in changes:
+                self._finish(command, str(error))
+            raise
+        for command in changes:
+            self._obey(command, pipeline)
+        return pipeline
+
+    def _obey(self, command: Command, pipeline: DepthPipeline) -> None:
+        """Do what was asked; what takes more than one frame only begins here."""
+        if command.verb == "learn_background":
+            self._learning.begin(pipeline, command)
+        elif command.verb == "drop_background":
+            self._learning.drop(pipeline, command)
+        elif command.verb == "refine":
+            self._refining.begin(pipeline, command)
+        else:
+            self._finish(command, f"this unit does not know how to {command.verb}")
+
+    def _report(
+        self,
+        pipeline: DepthPipeline,
+        assignment: Assignment,
+        frame: DepthFrame,
+        joints: JointEstimate | None,
+        stages: Stages,
+    ) -> Report:
+        """What a frame shows, and whether its camera can be trusted."""
+        stages.end("thread")
+        positions, uncertainty = known(joints)
+        voxels = pipeline.process(frame.depth, positions, joint_uncertainty_rad=uncertainty)
+        took = pipeline.last
+        stages.end("check", {"robot": took.expected_ns, "filter": took.points_ns, "density": took.voxels_ns})
+        voxels, seen, crowd = within_bounds(pipeline, voxels)
+        stance = self._stance.watch(pipeline, frame.captured_at_ns)
+        warning = stance.warning or self._joints.warning(assignment.settings.joint_delay_s) or crowd
+        health = health_of(pipeline, frame, stance, warning)
+        self._refining.gather(pipeline, frame.depth, joints)
+        keys = keys_to_bytes(voxels.keys)
+        stages.end("report")
+        return Report(assignment, frame.captured_at_ns, keys, seen, health, stages.took_ns)

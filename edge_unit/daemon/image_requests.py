@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pictures that people ask for: drawn between two frames, encoded and sent beside them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_unit.daemon.joint_lookup import known
+from edge_unit.daemon.pipeline_manager import AssignedPipeline
+from edge_unit.daemon.task_group import Errands
+from edge_unit.joints import JointEstimate
+from edge_unit.pipeline import picture_raw, png_of
+from edge_unit.sources import DepthFrame
+from edge_unit.uplink.uplink import Uplink
+from shared.errors import CellwatchError, InputError
+from shared.messages import Command, ImageKind
+
+NO_POSE = "the pose of its camera is not known yet"
+
+
+class Showing:
+    """One unit's pictures."""
+
+    def __init__(self, uplink: Uplink, assigned: AssignedPipeline, errands: Errands) -> None:
+        self._uplink = uplink
+        self._assigned = assigned
+        self._errands = errands
+
+    async def show(self, commands: Iterable[Command], frame: DepthFrame, joints: JointEstimate | None) -> None:
+        """Draw what `commands` ask for of the frame that was processed last."""
+        for command in commands:
+            if command.image is None:
+                continue
+            try:
+                picture = await asyncio.to_thread(self._draw, command.image, frame, joints)
+            except InputError as error:
+                self._uplink.finish(command, str(error))
+            else:
+                self._errands.start(self._send(command, picture))
+
+    def _draw(self, kind: ImageKind, frame: DepthFrame, joints: JointEstimate | None) -> NDArray[np.uint16]:
+        if kind == "depth":
+            return frame.depth.copy()
+        if self._assigned.pipeline is None:
+            raise InputError(NO_POSE)
+        positions, uncertainty = known(joints)
+        return picture_raw(kind, frame.depth, self._assigned.pipeline, positions, uncertainty)
+
+    async def _send(self, command: Command, picture: NDArray[np.uint16]) -> None:
+        assert self._assigned.camera is not None
+        scale_m = self._assigned.camera.intrinsics.depth_scale_m
+        try:
+            png = await asyncio.to_thread(png_of, picture, scale_m, command.raw)
+            await self._uplink.send_picture(command, png)
+        except CellwatchError as error:
+            self._uplink.finish(command, str(error))
+        else:
+            self._uplink.finish(command)

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the robot was when a frame was taken, by the master's clock, and whether the joints' times are right."""
+
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edge_unit.joints import DelayWatch, JointEstimate
+from edge_unit.pipeline import DepthPipeline
+from edge_unit.pipeline.depth_pipeline import EXACT
+from edge_unit.sources import DepthFrame
+from edge_unit.uplink.uplink import Assignment, Uplink
+from shared.clock import NS_PER_S
+
+
+class FrameJoints:
+    """The joints of one unit's frames."""
+
+    def __init__(self, uplink: Uplink) -> None:
+        self._uplink = uplink
+        self._delay = DelayWatch()
+
+    async def at(self, assignment: Assignment, frame: DepthFrame) -> JointEstimate | None:
+        """Where the robot was when the frame was taken; None when nobody knows."""
+        robot = assignment.cell.robot
+        if robot is None:
+            return None
+        if frame.joints is not None:
+            return JointEstimate(frame.joints, np.zeros(robot.joint_count))
+        clock = self._uplink.clock
+        if not clock.known:
+            return None
+        at_ns = frame.captured_at_ns + clock.offset_ns + round(assignment.settings.joint_delay_s * NS_PER_S)
+        await self._uplink.refresh_joints(at_ns)
+        uncertainty_ns = clock.uncertainty_ns(frame.captured_at_ns)
+        return self._uplink.joints.at(at_ns, uncertainty_ns, assignment.settings.robot_stale_after_s)
+
+    async def watch_delay(self, pipeline: DepthPipeline, frame: DepthFrame) -> None:
+        """Look whether the joints are later than the settings say; the frame was offered and need not wait."""
+        clock = self._uplink.clock
+        if frame.joints is not None or not clock.known:
+            return
+        at_ns = frame.captured_at_ns + clock.offset_ns
+        joints = self._delay.joints(self._uplink.joints)
+        if joints is not None:
+            await asyncio.to_thread(self._delay.look, joints)
+        if self._delay.due(at_ns):
+            await asyncio.to_thread(self._delay.keep, pipeline, frame.depth, at_ns)
+
+    def warning(self, joint_delay_s: float) -> str | None:
+        """What to set instead, where `joint_delay_s` is clearly off."""
+        return self._delay.warning(joint_delay_s)
+
+
+def known(joints: JointEstimate | None) -> tuple[NDArray[np.float64] | None, ArrayLike]:
+    """Positions (n,) and their uncertainty, as the pipeline takes them; None where nobody knows."""
+    return (None, EXACT) if joints is None else (joints.positions, joints.uncertainty)

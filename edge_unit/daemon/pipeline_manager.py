@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pipeline of the camera that is open, as the master's latest assignment has it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge_unit.daemon.background_learning import Learning
+from edge_unit.daemon.background_store import Place
+from edge_unit.daemon.warm_up import warm_up
+from edge_unit.monitoring import Stance, place_of
+from edge_unit.pipeline import DepthPipeline
+from edge_unit.sources import CameraInfo
+from edge_unit.uplink.uplink import Assignment
+from shared.settings import FilterSettings
+from shared.transforms import Transform
+
+
+class AssignedPipeline:
+    """Made with the first assignment of each camera, and changed by each that follows, between two frames.
+
+    Attributes:
+        camera: the one that is open, or was last.
+        pipeline: None until there is an assignment with a pose.
+        assignment: what the pipeline was made for.
+        refined: a pose that may come with an assignment although the camera did not move.
+    """
+
+    def __init__(self, learning: Learning, stance: Stance) -> None:
+        self._learning = learning
+        self._stance = stance
+        self.camera: CameraInfo | None = None
+        self.pipeline: DepthPipeline | None = None
+        self.assignment: Assignment | None = None
+        self.refined: Transform | None = None
+
+    def open(self, camera: CameraInfo) -> None:
+        """Frames are of this camera from now on."""
+        self.camera, self.pipeline, self.assignment = camera, None, None
+
+    @property
+    def place(self) -> Place:
+        """Where the camera stands."""
+        assert self.camera is not None
+        assert self.pipeline is not None
+        return Place(self.camera, self.pipeline.T_world_camera)
+
+    def prepare(self, assignment: Assignment, T_world_camera: Transform) -> DepthPipeline:
+        """The pipeline as `assignment` has it; takes seconds where there is much to be drawn.
+
+        Raises:
+            InputError: the assignment cannot be; the pipeline stays as it was.
+        """
+        assert self.camera is not None
+        pipeline, applied = self.pipeline, self.assignment
+        if pipeline is None or applied is None:
+            settings = _filter_settings(assignment)
+            pipeline = self.pipeline = DepthPipeline(self.camera.intrinsics, T_world_camera, assignment.cell, settings)
+            warm_up(pipeline)
+            self._settle(pipeline)
+        elif assignment is not applied:
+            settings = _filter_settings(assignment)
+            if assignment.cell is not applied.cell or settings != _filter_settings(applied):
+                pipeline.adopt(assignment.cell, settings)
+            if not np.array_equal(T_world_camera, pipeline.T_world_camera):
+                self._move(pipeline, T_world_camera)
+        self.assignment = assignment
+        return pipeline
+
+    def _move(self, pipeline: DepthPipeline, T_world_camera: Transform) -> None:
+        """The camera is elsewhere, or is merely known better: then what was learned holds."""
+        refined = self.refined is not None and np.array_equal(T_world_camera, self.refined)
+        pipeline.move(T_world_camera, refined=refined)
+        if refined:
+            self._learning.keep(pipeline, self.place)
+        self._settle(pipeline)
+
+    def _settle(self, pipeline: DepthPipeline) -> None:
+        """Take up what is known of the camera at this place."""
+        place = self.place
+        self._stance.begin(place_of(place.camera.serial, place.camera.intrinsics.shape, place.T_world_camera))
+        self._learning.find(pipeline, place)
+
+
+def _filter_settings(assignment: Assignment) -> FilterSettings:
+    """The part of the settings that the pipeline works with."""
+    return FilterSettings.model_validate(assignment.settings.model_dump(include=set(FilterSettings.model_fields)))

@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The daemon: source, pipeline and uplink held together.
+
+Frames are processed one after the other in a thread, while the event loop talks to the master. What the master
+changes (settings, cell, pose) is an `Assignment`, applied between two frames; a report carries the one that it was
+made with, so that nothing is ever merged under another lattice, cell or pose than it was made for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.metadata
+import logging
+from contextlib import aclosing, suppress
+
+from edge_unit.calibration.board_scan import BoardSearch
+from edge_unit.config import UnitConfig
+from edge_unit.daemon.background_learning import Learning
+from edge_unit.daemon.background_store import BackgroundStore
+from edge_unit.daemon.calibration_task import localise
+from edge_unit.daemon.command_batch import Orders, put_back
+from edge_unit.daemon.frame_processor import FrameWork
+from edge_unit.daemon.image_requests import NO_POSE, Showing
+from edge_unit.daemon.joint_lookup import FrameJoints
+from edge_unit.daemon.pipeline_manager import AssignedPipeline
+from edge_unit.daemon.refinement_task import Refining
+from edge_unit.daemon.report import troubled
+from edge_unit.daemon.task_group import Errands
+from edge_unit.daemon.warm_up import rehearse
+from edge_unit.monitoring import CameraStanding, Progress, Stages, Stance, Trace, boot_id
+from edge_unit.source_factory import is_recording
+from edge_unit.sources import DepthFrame, DepthSource, ReportsStatus
+from edge_unit.uplink.cell_cache import CellCache
+from edge_unit.uplink.client import MasterClient
+from edge_unit.uplink.master_discovery import MasterSearch
+from edge_unit.uplink.uplink import Assignment, Delivery, Report, Uplink
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.errors import InputError, SourceError
+from shared.messages import Command
+from shared.transforms import Transform
+
+logger = logging.getLogger(__name__)
+
+REOPEN_MIN_S = 0.2
+REOPEN_MAX_S = 5.0
+"""Between attempts to open a camera that does not deliver."""
+
+REHEARSAL_S = 5.0
+"""For kernels to be read from disk, on a busy machine."""
+
+FRAME_S_MAX = 5.0
+"""For one frame, where nothing has to be prepared: a hundred times what the slowest board takes."""
+
+PREPARE_S_MAX = 240.0
+"""For kernels to be compiled and a cell to be drawn anew on a board that has just begun to do both."""
+
+DRAIN_S = 2.0
+"""For the last frame of a recording to reach the master."""
+
+
+class Unit:
+    """One camera, one master; `run` until cancelled or until a recording ends."""
+
+    def __init__(self, config: UnitConfig, source: DepthSource, client: MasterClient | None = None) -> None:
+        """Reads and opens files, so make it before the event loop runs.
+
+        Raises:
+            ConfigError: the trace cannot be written, or the configured pose cannot be read.
+        """
+        self._config = config
+        self._source = source
+        self._masters: MasterSearch | None = None
+        if client is None:
+            self._masters = MasterSearch(config)
+            client = MasterClient(config.master_url, config.read_token, config.source_address, tls=config.tls())
+        self._client = client
+        self.uplink = Uplink(
+            client,
+            CellCache(config.state_dir / "cell"),
+            f"edge-unit {importlib.metadata.version('cellwatch')}",
+            boot_id(),
+            self._note,
+            self._masters,
+        )
+        self._camera = CameraStanding(config, self.uplink)
+        self._trace = None if config.trace_path is None else Trace(config.trace_path)
+        self._search = BoardSearch(source, config.board_stream)
+        self._joints = FrameJoints(self.uplink)
+        self._stance = Stance(config.state_dir)
+        self._learning = Learning(BackgroundStore(config.state_dir), config.learn_background_frames, self.uplink.finish)
+        self._assigned = AssignedPipeline(self._learning, self._stance)
+        self._refining = Refining(self.uplink, self._assigned, self._stance)
+        self._work = FrameWork(
+            self.uplink.finish, self._assigned, self._learning, self._refining, self._stance, self._joints
+        )
+        self._errands = Errands()
+        self._showing = Showing(self.uplink, self._assigned, self._errands)
+        self._progress = Progress()
+        self._rehearsal: asyncio.Task[None] | None = None
+        self._next_at_ns = 0
+        self._trouble: str | None = "no frame yet"
+        self._taken = 0
+        self._told = 0, monotonic_ns()
+
+    async def run(self) -> None:
+        """Watch and report.
+
+        Raises:
+            ConfigError: there is no token.
+            SourceError: a recording is missing or malformed.
+        """
+        async with self._client:
+            tasks = [asyncio.create_task(self.uplink.run()), asyncio.create_task(self._watch())]
+            if self._masters is not None:
+                tasks.append(asyncio.create_task(self._masters.run()))
+            if isinstance(self._source, ReportsStatus):
+                tasks.append(asyncio.create_task(self._camera.follow(self._source)))
+            try:
+                await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for task in tasks:
+                    task.cancel()
+                results = await asyncio.gather(*tasks, return_exceptions=True)
+                await self._errands.end()
+                if self._trace is not None:
+                    await asyncio.to_thread(self._trace.close)
+            for result in results:
+                if isinstance(result, Exception):
+                    raise result
+
+    # ------------------------------------------------------------------ how it goes
+
+    def status(self) -> str:
+        """One line for a person: camera, frames a second since it was asked last, master."""
+        taken, now_ns = self._taken, monotonic_ns()
+        (before, since_ns), self._told = self._told, (taken, now_ns)
+        trouble = self.uplink.trouble or self._trouble
+        if trouble is None:
+            trouble = f"live, {(taken - before) * NS_PER_S / max(now_ns - since_ns, 1):.1f} fps"
+        return f"{trouble}; {self.uplink.standing}"
+
+    def stuck(self) -> str | None:
+        """What hangs and will not come to its end by itself; waiting for a camera or a master is not of that kind."""
+        return self._progress.stuck(monotonic_ns())
+
+    def _note(self, report: Report, delivery: Delivery | None) -> None:
+        if self._trace is not None:
+            self._trace.note(report, delivery)
+
+    # ------------------------------------------------------------------ the camera
+
+    async def _watch(self) -> None:
+        """Take frames for as long as there are any; a camera that fails is opened again."""
+        retry_s = REOPEN_MIN_S
+        while True:
+            try:
+                await self._open()
+                async with aclosing(self._source.frames()) as frames:
+                    async for frame in frames:
+                        retry_s = REOPEN_MIN_S
+                        await self._take(frame)
+                await self._end()
+                return
+            except SourceError as error:
+                if is_recording(self._config.source):
+                    raise
+                await self._camera.failed(error)
+            finally:
+                await self._source.close()
+            await asyncio.sleep(retry_s)
+            retry_s = min(2.0 * retry_s, REOPEN_MAX_S)
+
+    async def _open(self) -> None:
+        if self._rehearsal is None:
+            self._rehearsal = asyncio.create_task(asyncio.to_thread(self._rehearse))
+        camera = await self._source.open()
+        # Who registers is live with the next frame; but a unit that has to compile first tells that it is there.
+        await asyncio.wait((self._rehearsal,), timeout=REHEARSAL_S)
+        self._assigned.open(camera)
+        await self._camera.opened(camera)
+        await asyncio.gather(self.uplink.assigned.wait(), self._rehearsal)
+        assignment = self.uplink.assignment
+        if assignment is not None and assignment.T_world_camera is not None:
+            # Before the camera delivers, so that no frame has to wait for what is compiled and drawn only once.
+            # What cannot be prepared is told with each frame, for the master may change it.
+            with suppress(InputError), self._progress.working("preparing for frames", PREPARE_S_MAX):
+                await asyncio.to_thread(self._assigned.prepare, assignment, assignment.T_world_camera)
+
+    def _rehearse(self) -> None:
+        with self._progress.working("compiling the kernels", PREPARE_S_MAX):
+            rehearse()
+
+    async def _end(self) -> None:
+        """A recording has no more frames."""
+        await self.uplink.drained(DRAIN_S)
+        if self._learning.progress is None:
+            logger.info("the recording has come to its end")
+        else:
+            logger.warning("the recording ended after %d of the %d frames to be learned", *self._learning.progress)
+
+    # ------------------------------------------------------------------ a frame
+
+    async def _take(self, frame: DepthFrame) -> None:
+        """Do with one frame what its time, the master's assignment and its orders ask for."""
+        if not self._is_due(frame):
+            return
+        assignment = self.uplink.assignment or self._assigned.assignment
+        if assignment is None:
+            return
+        orders = Orders.take(self.uplink.commands)
+        if orders.calibrations:
+            put_back(self.uplink.commands, (*orders.changes, *orders.pictures))
+            # The frame is of before the look, and its memory may be gone afterwards.
+            outcome = await localise(self._search, self.uplink, assignment, frame)
+            self._finish(orders.calibrations, outcome)
+        elif assignment.T_world_camera is None:
+            await self._look_for_pose(assignment, frame, orders)
+        else:
+            await self._filter(assignment, assignment.T_world_camera, frame, orders)
+
+    def _is_due(self, frame: DepthFrame) -> bool:
+        """Whether `fps_max` leaves time for it."""
+        if self._config.fps_max is None:
+            return True
+        if frame.captured_at_ns < self._next_at_ns:
+            return False
+        self._next_at_ns = frame.captured_at_ns + round(0.9 * NS_PER_S / self._config.fps_max)
+        return True
+
+    async def _look_for_pose(self, assignment: Assignment, frame: DepthFrame, orders: Orders) -> None:
+        """Say that nobody knows where the camera stands, and look for the board now and then."""
+        self._assigned.pipeline = None
+        self._finish(orders.changes, NO_POSE)
+        searching = f"looking for the board: {self._search.outcome}" if self._search.outcome else None
+        report = troubled(assignment, frame, searching)
+        self._trouble = report.health.trouble or NO_POSE
+        self.uplink.offer(report)
+        await self._showing.show(orders.pictures, frame, None)
+        wanted = self._config.localise and assignment.cell.board is not None
+        if wanted and self._search.due(monotonic_ns()):
+            await localise(self._search, self.uplink, assignment, frame)
+
+    async def _filter(
+        self, assignment: Assignment, T_world_camera: Transform, frame: DepthFrame, orders: Orders
+    ) -> None:
+        """Process the frame and offer the result; nothing that follows delays it."""
+        stages = Stages(frame.captured_at_ns)
+        stages.end("source")
+        joints = await self._joints.at(assignment, frame)
+        stages.end("joints")
+        prepared = assignment is self._assigned.assignment and not orders.changes and not orders.pictures
+        with self._progress.working(f"frame {frame.frame_number}", FRAME_S_MAX if prepared else PREPARE_S_MAX):
+            if self._trace is not None:
+                await asyncio.to_thread(self._trace.flush)
+            report = await asyncio.to_thread(
+                self._work.process, assignment, T_world_camera, frame, joints, orders.changes, stages
+            )
+        self._taken += 1
+        self._tell_change(report.health.trouble)
+        self.uplink.offer(report)
+        await self._showing.show(orders.pictures, frame, joints)
+        pipeline = self._assigned.pipeline
+        if pipeline is not None and joints is not None and report.health.trouble is None:
+            await self._joints.watch_delay(pipeline, frame)
+        if self._stance.unsaved:
+            self._errands.start(asyncio.to_thread(self._stance.save))
+        gathered = self._refining.take()
+        if gathered is not None:
+            self._errands.start(self._refining.refine(gathered))
+
+    def _tell_change(self, trouble: str | None) -> None:
+        """Have the log say when trouble begins or ends."""
+        if (trouble is None) != (self._trouble is None):
+            logger.info("%s", trouble or "frames are filtered and reported")
+        self._trouble = trouble
+
+    def _finish(self, commands: list[Command], outcome: str) -> None:
+        for command in commands:
+            self.uplink.finish(command, outcome)

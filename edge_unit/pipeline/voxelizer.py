@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Foreground pixels become voxels of the cell's lattice (Algorithms 1, 6 and 7)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_unit.pipeline.edge_halo import EdgeHalo
+from edge_unit.pipeline.expected_depth import RobotLayer
+from geometry.kernels import density, points, voxelize
+from shared.camera import Intrinsics
+from shared.lattice import Lattice
+from shared.settings import FilterSettings
+from shared.transforms import Transform, apply, inverse
+
+
+@dataclass(frozen=True, eq=False)
+class Voxels:
+    """Obstacle voxels of one frame.
+
+    Attributes:
+        keys: (N,) uint32, ascending, as `Lattice.keys` has them.
+        counts: (N,) uint32, the foreground pixels that fell into each.
+        lattice: on which they lie.
+    """
+
+    keys: NDArray[np.uint32]
+    counts: NDArray[np.uint32]
+    lattice: Lattice
+
+    @property
+    def indices(self) -> NDArray[np.int16]:
+        """(N, 3) int16."""
+        return self.lattice.indices(self.keys)
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def nearest(self, position_m: NDArray[np.float64], most: int) -> tuple[Voxels, Voxels]:
+        """At most so many of them, those nearest to a place (3,) of the world, and the others."""
+        distance_m = np.linalg.norm(self.lattice.centres(self.indices) - position_m, axis=1)
+        chosen = np.zeros(len(self), np.bool_)
+        chosen[np.argsort(distance_m, kind="stable")[:most]] = True
+        return self._only(chosen), self._only(~chosen)
+
+    def _only(self, chosen: NDArray[np.bool_]) -> Voxels:
+        return Voxels(self.keys[chosen], self.counts[chosen], self.lattice)
+
+
+class Voxelizer:
+    """Counts points on a lattice as one camera sees it; its memory is taken once, for the worst frame."""
+
+    def __init__(
+        self, intrinsics: Intrinsics, T_world_camera: Transform, lattice: Lattice, settings: FilterSettings
+    ) -> None:
+        self.lattice = lattice
+        self._intrinsics = intrinsics
+        self._settings = settings
+        most = min(intrinsics.width * intrinsics.height, lattice.cell_count)
+        self._shape = np.array(lattice.shape, np.int32)
+        self._counts = np.zeros(int(np.prod(self._shape + 2, dtype=np.int64)) + 1, np.uint32)
+        stride = -(-intrinsics.width // voxelize.PIXELS_PER_WORD) * voxelize.PIXELS_PER_WORD
+        # Behind the picture's last column it stays zero.
+        self._mask = np.zeros((points.ROWS_AT_ONCE, stride), np.uint8)
+        self._slots = np.empty(intrinsics.width, np.int32)
+        self._touched = np.empty(most + 1, np.uint32)
+        self._kept = np.empty(most + 1, np.uint32)
+        self._kept_counts = np.empty(most + 1, np.uint32)
+        self._scratch = np.empty((6, density.AT_ONCE))
+        self._keys = np.empty(density.AT_ONCE, np.uint32)
+        self.place(T_world_camera)
+
+    def place(self, T_world_camera: Transform) -> None:
+        """The camera stands elsewhere from now on."""
+        camera, lattice = self._intrinsics, self.lattice
+        voxels_per_m = T_world_camera[:3, :3] / lattice.voxel_size_m
+        per_raw = voxels_per_m * camera.depth_scale_m
+        u = (np.arange(camera.width) - camera.cx) / camera.fx
+        v = (np.arange(camera.height) - camera.cy) / camera.fy
+        self._column_rays = (per_raw[:, :1] * u + per_raw[:, 2:]).astype(np.float32)
+        self._row_rays = (v[:, None] * per_raw[:, 1]).astype(np.float32)
+        self._origin = ((T_world_camera[:3, 3] - lattice.origin_m) / lattice.voxel_size_m).astype(np.float32)
+        T_camera_world = inverse(T_world_camera)
+        self._first_centre_camera_m = apply(T_camera_world, lattice.centres(np.zeros(3)))
+        self._axes_camera = np.ascontiguousarray(T_camera_world[:3, :3] * lattice.voxel_size_m)
+        self._degrees_per_column = math.degrees(2.0 * math.atan(camera.width / (2.0 * camera.fx))) / camera.width
+        self._degrees_per_row = math.degrees(2.0 * math.atan(camera.height / (2.0 * camera.fy))) / camera.height
+
+    def count(
+        self,
+        depth_raw: NDArray[np.uint16],
+        room_raw: NDArray[np.uint16],
+        minimum_raw: int,
+        robot: RobotLayer,
+        halo: EdgeHalo,
+    ) -> int:
+        """Count the foreground of `depth_raw` (H, W); returns how many voxels hold any. `keep_dense` must follow.
+
+        `room_raw` (H, W) and `minimum_raw` as in `foreground.foreground_mask`.
+        """
+        return points.count_foreground(
+            depth_raw,
+            room_raw,
+            robot.near_raw,
+            robot.span_raw,
+            robot.columns,
+            minimum_raw,
+            halo.runs,
+            halo.near_raw,
+            halo.span_raw,
+            self._column_rays,
+            self._row_rays,
+            self._origin,
+            self._shape,
+            self._mask.view(np.uint64),
+            self._mask,
+            self._slots,
+            self._counts,
+            self._touched,
+        )
+
+    def keep_dense(self, found: int) -> Voxels:
+        """The voxels that hold enough points, and forget all `found` of them."""
+        settings = self._settings
+        # In the order of memory: judging them is then several times as fast, and the kept ones come sorted.
+        self._touched[:found].sort()
+        kept = density.keep_dense(
+            self._counts,
+            self._touched,
+            found,
+            self._shape,
+            self.lattice.voxel_size_m,
+            self._first_centre_camera_m,
+            self._axes_camera,
+            self._intrinsics.fx,
+            self._intrinsics.fy,
+            self._degrees_per_column,
+            self._degrees_per_row,
+            settings.density_model == "angular",
+            settings.density_rule == "single",
+            settings.occupancy_threshold,
+            settings.own_share_min,
+            settings.support_area_max_m2,
+            settings.support_points_min,
+            self._scratch,
+            self._keys,
+            self._kept,
+            self._kept_counts,
+        )
+        voxelize.forget(self._counts, self._touched, found)
+        return Voxels(self._kept[:kept].copy(), self._kept_counts[:kept].copy(), self.lattice)

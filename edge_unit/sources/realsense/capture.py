@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Captures one stream: finds the camera, streams, and ends when anything goes wrong, telling all of it over the link.
+
+For a process of its own (`capture_process`); there is one way to recover from whatever happens: the next process.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+from typing import Any
+
+import numpy as np
+import pyrealsense2 as rs
+
+from edge_unit.sources.realsense import capture_link as link
+from edge_unit.sources.realsense.devices import Devices, RecordingBroken, Unplugged, survey
+from edge_unit.sources.realsense.shared_frames import SharedFrames
+from edge_unit.sources.realsense.stream import Reading, SdkStream
+from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
+from shared.errors import SourceEnded, SourceError
+
+READ_S = 0.1
+"""How long one wait for a frame may be; then whoever listens is told that we live."""
+
+ALIVE_EVERY_NS = 100 * NS_PER_MS
+
+FIRST_FRAME_S = 6.0
+"""From the start of the stream: cameras settle their exposure first, some for seconds."""
+
+SILENCE_S = 2.0
+SILENCE_PERIODS = 4
+"""Without a frame, once they came: the stream is stuck, and waiting was never seen to help."""
+
+CUT_SHORT_S = 0.5
+"""Left at the end of a recording: far more than lies between its last frame and its end."""
+
+
+class Capture:
+    """One run: from looking for the camera to whatever ends it."""
+
+    def __init__(self, end: socket.socket, request: link.Request, context: rs.context) -> None:
+        self._end = end
+        self._request = request
+        self._devices = Devices(context, request)
+        self._stop = threading.Event()
+        self._taken = threading.Condition()
+        self._taken_number = 0
+        self._told_ns = 0
+
+    def run(self) -> None:
+        """Capture until stopped. All that goes wrong is told over the link."""
+        threading.Thread(target=self._listen, name="link", daemon=True).start()
+        try:
+            self._tell(link.Phase("waiting"))
+            device = self._wait_for_device()
+            if device is not None:
+                if self._request.reset:
+                    self._tell(link.Phase("resetting"))
+                    device = self._devices.reset(device)
+                self._tell(link.Phase("starting"))
+                self._stream(SdkStream(device, self._request))
+        except SourceEnded:
+            self._tell(link.Ended())
+        except RecordingBroken as error:
+            self._tell(link.Failed(str(error), final=True))
+        except SourceError as error:
+            self._tell(link.Failed(str(error), unplugged=isinstance(error, Unplugged)))
+
+    def _wait_for_device(self) -> Any:
+        """The device, or None when there is no more need of it."""
+        told = ""
+        while not self._stop.is_set():
+            device, reason = self._devices.find()
+            if device is not None:
+                return device
+            if reason != told:
+                self._tell(link.Phase("waiting", reason))
+                told = reason
+            self._alive()
+            self._devices.wait()
+        return None
+
+    def _stream(self, stream: SdkStream) -> None:
+        """Pass frames on until there are no more, or nobody wants any."""
+        opened = stream.start()
+        shape: tuple[int, ...] = (opened.height, opened.width)
+        shape += (opened.channels,) if opened.channels > 1 else ()
+        dtype = np.uint16 if self._request.stream == "depth" else np.uint8
+        descriptor = SharedFrames.create(shape, dtype)
+        frames = SharedFrames(descriptor, shape, dtype)
+        link.send(self._end, opened, descriptor)
+        os.close(descriptor)
+        base, last = self._request.number_base, self._request.resume_after
+        silence_ns = round(max(SILENCE_S, SILENCE_PERIODS / max(opened.fps, 1)) * NS_PER_S)
+        deadline_ns = monotonic_ns() + round(FIRST_FRAME_S * NS_PER_S)
+        while not self._stop.is_set():
+            if self._devices.removed.is_set():
+                raise Unplugged(f"camera {opened.serial} was unplugged")
+            try:
+                reading = stream.read(READ_S)
+            except SourceEnded:
+                self._check_complete(stream.left_out_s, last)
+                if not self._request.loop:
+                    raise
+                base += last
+                stream.rewind()
+                continue
+            if reading is not None:
+                last = reading.camera_number
+                self._deliver(frames, reading, base + last)
+                deadline_ns = monotonic_ns() + silence_ns
+            elif monotonic_ns() > deadline_ns:
+                raise SourceError(f"camera {opened.serial} stopped sending frames")
+            self._alive()
+        stream.stop()
+
+    def _deliver(self, frames: SharedFrames, reading: Reading, number: int) -> None:
+        frames.write(reading.pixels, number, reading.camera_number, reading.captured_at_ns, reading.position_ns)
+        link.offer(self._end, link.Delivered())
+        with self._taken:
+            while self._request.lockstep and self._taken_number < number and not self._stop.is_set():
+                # The reader may be busy for long; what was offered may have been lost.
+                if not self._taken.wait(READ_S):
+                    link.offer(self._end, link.Delivered())
+
+    def _check_complete(self, left_out_s: float, last: int) -> None:
+        """The SDK ends a recording without a word where it cannot read on."""
+        if left_out_s > CUT_SHORT_S:
+            raise RecordingBroken(
+                f"{self._request.recording}: cannot be read beyond frame {last}, "
+                f"{left_out_s:.1f} s before its end; it may be damaged"
+            )
+
+    def _alive(self) -> None:
+        if monotonic_ns() - self._told_ns > ALIVE_EVERY_NS:
+            self._told_ns = monotonic_ns()
+            link.offer(self._end, link.Alive())
+
+    def _tell(self, message: link.Message) -> None:
+        link.send(self._end, message)
+
+    def _listen(self) -> None:
+        """Hear what the other end says, and go when it is gone: even a main thread that hangs then goes along."""
+        while (received := link.receive(self._end)) is not None:
+            message, _ = received
+            with self._taken:
+                if isinstance(message, link.Taken):
+                    self._taken_number = message.number
+                elif isinstance(message, link.Stop):
+                    self._stop.set()
+                self._taken.notify_all()
+        os._exit(0)
+
+
+def serve(end: socket.socket) -> None:
+    """Do what the first message of the link asks for."""
+    context = rs.context()
+    received = link.receive(end)
+    request = received[0] if received is not None else None
+    if isinstance(request, link.Survey):
+        link.send(end, link.Found(rs.__version__, survey(context)))
+    elif isinstance(request, link.Request):
+        Capture(end, request, context).run()

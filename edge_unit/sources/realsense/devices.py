@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which cameras the RealSense SDK sees, and the one that is wanted. Blocking; for the capture process alone.
+
+A recording is loaded onto the SDK's context, where it is a device like any other.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyrealsense2 as rs
+
+from edge_unit.sources.realsense.capture_link import Request
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.errors import SourceError
+
+GONE_S = 3.0
+RETURN_S = 10.0
+"""After a reset a camera goes within a second or two, and is back some 3 s later."""
+
+LOOK_EVERY_S = 0.5
+"""For a camera that is not there, since the SDK's own notice of it is sometimes missed."""
+
+
+class RecordingBroken(SourceError):
+    """A recording that cannot be played; to begin anew would not help."""
+
+
+class Unplugged(SourceError):
+    """The camera was there, and is not any more."""
+
+
+class Devices:
+    """Finds the device of a request on a context."""
+
+    def __init__(self, context: rs.context, request: Request) -> None:
+        self._context = context
+        self._request = request
+        self._device: Any = None
+        self._recording: Any = None
+        self._changed = threading.Event()
+        self.removed = threading.Event()
+        """Set when the device that was found is unplugged."""
+        context.set_devices_changed_callback(self._on_change)
+
+    def find(self) -> tuple[Any, str]:
+        """The device, or None and why it is not there, in one sentence.
+
+        Raises:
+            RecordingBroken: the recording cannot be opened.
+        """
+        self._changed.clear()
+        if self._request.recording:
+            if self._recording is None:
+                self._recording = self._load(self._request.recording)
+            return self._recording, ""
+        try:
+            devices = {serial_of(device): device for device in self._context.query_devices()}
+        except RuntimeError as error:
+            # A device that goes while the SDK lists it.
+            return None, f"the list of cameras cannot be read: {error}"
+        device, reason = _chosen(devices, self._request.serial)
+        self._device = device
+        return device, reason
+
+    def wait(self, timeout_s: float = LOOK_EVERY_S) -> None:
+        """Until a device comes or goes, but no longer than `timeout_s`."""
+        self._changed.wait(timeout_s)
+
+    def reset(self, device: Any) -> Any:
+        """Reset the hardware of `device`, and return the device that comes back.
+
+        Raises:
+            SourceError: none did.
+        """
+        self.removed.clear()
+        device.hardware_reset()
+        # Not every kernel tells when it goes; then it must at least be there at the end.
+        self.removed.wait(GONE_S)
+        deadline_ns = monotonic_ns() + round(RETURN_S * NS_PER_S)
+        while True:
+            returned, reason = self.find()
+            if returned is not None:
+                self.removed.clear()
+                return returned
+            if monotonic_ns() > deadline_ns:
+                raise SourceError(f"after a reset: {reason}; unplug it and plug it in again")
+            self.wait()
+
+    def _load(self, path: str) -> Any:
+        if not Path(path).is_file():
+            raise RecordingBroken(f"{path}: there is no such recording")
+        try:
+            return self._context.load_device(path)
+        except RuntimeError as error:
+            why = str(error).rsplit(": ", 1)[-1]
+            raise RecordingBroken(
+                f"{path}: no recording that can be played; it may have been cut short ({why})"
+            ) from error
+
+    def _on_change(self, info: rs.event_information) -> None:
+        """On a thread of the SDK: only raises flags."""
+        if self._device is not None and info.was_removed(self._device):
+            self.removed.set()
+        self._changed.set()
+
+
+def survey(context: rs.context) -> list[dict[str, Any]]:
+    """The cameras on a context, each with what a person wants to know of it."""
+    return [
+        {
+            "serial": serial_of(device),
+            "model": info_of(device, rs.camera_info.name),
+            "firmware": info_of(device, rs.camera_info.firmware_version),
+            "recommended_firmware": info_of(device, rs.camera_info.recommended_firmware_version),
+            "usb": info_of(device, rs.camera_info.usb_type_descriptor),
+        }
+        for device in context.query_devices()
+    ]
+
+
+def serial_of(device: Any) -> str:
+    """A device's serial number; empty where it has none (in recovery mode)."""
+    return info_of(device, rs.camera_info.serial_number)
+
+
+def info_of(device: Any, what: rs.camera_info) -> str:
+    """What a device tells of itself; empty where it tells nothing."""
+    return str(device.get_info(what)) if device.supports(what) else ""
+
+
+def profiles_of(device: Any) -> Iterator[tuple[Any, Any]]:
+    """Each sensor of a device with each of its stream profiles."""
+    for sensor in device.query_sensors():
+        for profile in sensor.get_stream_profiles():
+            yield sensor, profile
+
+
+def _chosen(devices: dict[str, Any], wanted: str) -> tuple[Any, str]:
+    """The wanted device, or the only one; or None, and why."""
+    there = ", ".join(serial or "one without a serial number" for serial in sorted(devices)) or "none"
+    if wanted in devices:
+        return devices[wanted], ""
+    if wanted:
+        return None, f"no RealSense camera {wanted} is connected (there is {there})"
+    if len(devices) > 1:
+        return None, f"{len(devices)} RealSense cameras are connected ({there}); choose one by source.serial"
+    if not devices:
+        return None, "no RealSense camera is connected; check its cable, and the udev rules (edge-unit doctor)"
+    return next(iter(devices.values())), ""

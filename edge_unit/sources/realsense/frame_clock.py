@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When a frame of the RealSense SDK was taken, by our clock: what the SDK tells of time, handed to `CameraClock`."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any
+
+import pyrealsense2 as rs
+
+from edge_unit.sources.realsense.camera_clock import CameraClock
+from shared.clock import NS_PER_MS, NS_PER_S, NS_PER_US, monotonic_ns, wall_ns
+
+COMPARE_EVERY_NS = NS_PER_S
+"""Clocks drift by less than 0.1 ms in the time between two readings of the camera's clock."""
+
+EXPOSURE_MAX_US = 100_000
+"""Between the middle of the exposure and the read-out; what is more is no exposure."""
+
+
+class SdkClock:
+    """Of one stream. `device` is asked for its time now and then, but for None: a recording has no clock that runs."""
+
+    def __init__(self, device: Any | None, latency_ns: int) -> None:
+        self._device = device
+        self._latency_ns = latency_ns
+        self._clocks: dict[Any, CameraClock] = {}
+        self._compared_ns = 0
+
+    def captured_at_ns(self, frame: Any, arrived_ns: int) -> int:
+        """Middle of the exposure of a frame that arrived at `arrived_ns`, CLOCK_MONOTONIC."""
+        domain = frame.get_frame_timestamp_domain()
+        if domain not in self._clocks:
+            # It may change while we look: the SDK stamps the arrival wherever the kernel passes no metadata on.
+            wraps = domain == rs.timestamp_domain.hardware_clock
+            self._clocks[domain] = CameraClock(self._latency_ns, wraps=wraps)
+        clock = self._clocks[domain]
+        if self._device is not None and arrived_ns - self._compared_ns >= COMPARE_EVERY_NS:
+            self._compared_ns = arrived_ns
+            self._compare(self._device, clock, domain)
+        return clock.captured_at_ns(round(frame.get_timestamp() * NS_PER_MS), arrived_ns) - _exposure_ns(frame)
+
+    def _compare(self, device: Any, clock: CameraClock, domain: Any) -> None:
+        asked_ns = monotonic_ns()
+        if domain == rs.timestamp_domain.global_time:
+            clock.compare(asked_ns, wall_ns(), monotonic_ns())
+        elif domain == rs.timestamp_domain.hardware_clock:
+            # Not every camera can be asked; the fastest frame decides then.
+            with suppress(RuntimeError):
+                clock.compare(asked_ns, round(device.get_device_time_ms() * NS_PER_MS), monotonic_ns())
+
+
+def _exposure_ns(frame: Any) -> int:
+    """From the middle of the exposure to the stamp, which is of the read-out."""
+    read_out, middle = rs.frame_metadata_value.frame_timestamp, rs.frame_metadata_value.sensor_timestamp
+    if not (frame.supports_frame_metadata(read_out) and frame.supports_frame_metadata(middle)):
+        return 0
+    span_us = int(frame.get_frame_metadata(read_out)) - int(frame.get_frame_metadata(middle))
+    return span_us * NS_PER_US if 0 <= span_us <= EXPOSURE_MAX_US else 0

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a unit can ask the master, each call one request; errors of HTTP become ours here."""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+
+from edge_unit.tls import tls_context
+from shared.errors import ConfigError, MasterRefused, MasterUnreachable, WireError
+from shared.messages import (
+    ImageKind,
+    InitializeAnswer,
+    InitializeRequest,
+    PoseAnswer,
+    PoseQuality,
+    PoseRequest,
+    RobotAnswer,
+    UpdateAnswer,
+    UpdateRequest,
+)
+from shared.transforms import Transform
+from shared.wire import MAX_ANSWER_BYTES, MEDIA_TYPE, decode, decode_update_answer, encode, encode_update, unpack
+
+TIMEOUT = httpx.Timeout(2.0, connect=0.5)
+"""A master that takes longer is as good as gone: the next frame is worth more than the answer to this one.
+
+A connection that is asked for while the network is cut does not come when it heals, for the kernel asks again only
+after a second: so ask for another one before."""
+
+TRANSFER_TIMEOUT_S = 30.0
+"""For a mesh of MAX_MESH_BYTES over a network that is slow but works."""
+
+MAX_MESH_BYTES = 128 * 2**20
+"""Of one mesh; a robot link has a hundredth of it."""
+
+IMAGE_TIMEOUT_S = 5.0
+"""For a picture; whoever asked for it waits no longer."""
+
+LIMITS = httpx.Limits(max_connections=4, max_keepalive_connections=4, keepalive_expiry=60.0)
+"""Update, joints, cell and pose may each be under way."""
+
+MSGPACK_BOTH_WAYS = {"Content-Type": MEDIA_TYPE, "Accept": MEDIA_TYPE}
+
+ERROR_CHARS = 300
+"""Of the master's reason."""
+
+
+class MasterClient:
+    """A connection to one master, kept open between calls."""
+
+    def __init__(
+        self,
+        url: str | None,
+        read_token: Callable[[], str],
+        source_address: str | None = None,
+        transport: httpx.AsyncBaseTransport | None = None,
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
+        """`read_token` is asked at each registration; `source_address` is an own IP to connect from.
+
+        `transport` carries the requests in place of a network. `tls` is what is asked of the master's certificate,
+        see `trust`; without, a master at https is held against the CAs of the system. With `url` None there is no
+        master until `aim` names one.
+        """
+        self._read_token = read_token
+        self._tls = tls
+        self.url = ""
+        """Empty: there is no master yet."""
+        if transport is None:
+            # Also where this master speaks no TLS: another one may.
+            transport = httpx.AsyncHTTPTransport(
+                verify=tls or tls_context(), local_address=source_address, limits=LIMITS
+            )
+        self._http = httpx.AsyncClient(
+            transport=transport,
+            timeout=TIMEOUT,
+            # No proxy from the environment: the master is on our own network.
+            trust_env=False,
+        )
+        if url is not None:
+            self.aim(url)
+        # They would cost a hundred bytes in every update and tell the master nothing.
+        for name in ("Accept", "Accept-Encoding", "Connection", "User-Agent"):
+            del self._http.headers[name]
+
+    def aim(self, url: str) -> None:
+        """Talk to the master at `url` from now on.
+
+        Raises:
+            ConfigError: it is no URL, or not https although the master's certificate is to be checked.
+        """
+        parts = urlsplit(url)
+        if not parts.hostname:
+            raise ConfigError(f"master_url: expected http://host:port, got {url}")
+        if self._tls is not None and parts.scheme != "https":
+            raise ConfigError(f"master_url: expected https, since the master's certificate is to be checked, got {url}")
+        self.url = url.rstrip("/")
+        self._http.base_url = httpx.URL(self.url)
+
+    async def __aenter__(self) -> MasterClient:
+        await self.authorize()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._http.aclose()
+
+    async def authorize(self) -> None:
+        """Read the token again.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        token = await asyncio.to_thread(self._read_token)
+        self._http.headers["Authorization"] = f"Bearer {token}"
+
+    async def initialize(self, request: InitializeRequest) -> InitializeAnswer:
+        """Ask for a slot. Raises as `update`."""
+        return decode(InitializeAnswer, await self._call("POST", "/initialize", encode(request)))
+
+    async def update(self, update: UpdateRequest) -> UpdateAnswer:
+        """Report a frame.
+
+        Raises:
+            MasterUnreachable: nobody answered in time.
+            MasterRefused: the master said no; `status` tells how.
+            WireError: the answer is none of ours.
+        """
+        headers = {"Content-Type": MEDIA_TYPE}
+        return decode_update_answer(await self._call("POST", "/update", encode_update(update), headers))
+
+    async def robot(self, since_ns: int, timeout_s: float) -> RobotAnswer:
+        """Joints after `since_ns` by the master's clock. Raises as `update`."""
+        data = await self._call("GET", f"/robot?since_ns={since_ns}", timeout=httpx.Timeout(timeout_s))
+        return decode(RobotAnswer, data)
+
+    async def put_pose(
+        self, unit_id: int, T_world_camera: Transform, origin: str, quality: PoseQuality | None = None
+    ) -> int:
+        """Tell where the camera is; returns the version of the pose. Raises as `update`."""
+        document = {"T_world_camera": T_world_camera.tolist(), "origin": origin, "quality": quality or PoseQuality()}
+        request = PoseRequest.model_validate(document)
+        data = await self._call("PUT", f"/units/{unit_id}/pose", encode(request))
+        return decode(PoseAnswer, data).pose
+
+    async def put_image(self, unit_id: int, kind: ImageKind, command_id: int, png: bytes) -> None:
+        """Send a picture that a command asks for. Raises as `update`."""
+        path = f"/units/{unit_id}/images/{kind}?command={command_id}"
+        await self._call("PUT", path, png, {"Content-Type": "image/png"}, IMAGE_TIMEOUT_S)
+
+    async def cell_document(self) -> dict[str, Any]:
+        """The cell's document. Raises as `update`."""
+        document = unpack(await self._call("GET", "/cell", timeout=TRANSFER_TIMEOUT_S), MAX_ANSWER_BYTES)
+        if not isinstance(document, dict):
+            raise WireError(f"cell: expected a document, got {type(document).__name__}")
+        return document
+
+    async def mesh(self, sha256: str) -> bytes:
+        """A mesh in its canonical bytes. Raises as `update`."""
+        return await self._call("GET", f"/cell/meshes/{sha256}", timeout=TRANSFER_TIMEOUT_S, limit=MAX_MESH_BYTES)
+
+    async def _call(
+        self,
+        method: str,
+        path: str,
+        body: bytes | None = None,
+        headers: Mapping[str, str] = MSGPACK_BOTH_WAYS,
+        timeout: httpx.Timeout | float = TIMEOUT,
+        limit: int = MAX_ANSWER_BYTES,
+    ) -> bytes:
+        if not self.url:
+            raise MasterUnreachable("no master is known yet")
+        received = bytearray()
+        try:
+            async with self._http.stream(method, path, content=body, headers=headers, timeout=timeout) as response:
+                async for chunk in response.aiter_bytes():
+                    received += chunk
+                    if len(received) > limit:
+                        raise WireError(f"{self.url}{path}: expected at most {limit} bytes, got more")
+        except httpx.HTTPError as error:
+            raise MasterUnreachable(f"{self.url}{path}: {str(error) or type(error).__name__}") from error
+        if response.is_error:
+            raise MasterRefused(f"{self.url}{path}: {response.status_code}: {_reason(received)}", response.status_code)
+        return bytes(received)
+
+
+def _reason(body: bytearray) -> str:
+    """The one sentence of a refusal, whichever way it was encoded."""
+    text = bytes(body[:ERROR_CHARS]).decode("utf-8", "replace")
+    return text.removeprefix('{"detail":"').removesuffix('"}')

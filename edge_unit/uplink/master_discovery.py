@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Looks for the master while it is not known or does not answer, and is silent while it does.
+
+A place is only taken when somebody listens there who passes for the master: with `master_ca` or `master_fingerprint`
+that is a TLS handshake with the right certificate, and whoever fails it hears no more of us, not even a request.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import logging
+import ssl
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from edge_unit.config import UnitConfig
+from edge_unit.tls import tls_context
+from edge_unit.uplink.master_selection import (
+    Candidate,
+    Kept,
+    Place,
+    Wanted,
+    choose,
+    distrusted,
+    first_place,
+    in_order,
+    objection,
+)
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.discovery import MAX_OFFERS, Browser, Offer, own_addresses
+from shared.files import StateFile
+from shared.waiting import within
+
+logger = logging.getLogger(__name__)
+
+LOST_S = 2.0
+"""A master that is restarted is back sooner; then others are looked for."""
+
+LOOK_S = 2.0
+"""Between looks, unless somebody new is heard of."""
+
+HEAR_S = 1.0
+"""From the first master that is heard of to the choice: others answer within a fifth of a second."""
+
+HEAR_FIRST_S = 2.0
+"""... where it is a choice among all cells, and for good: all are asked again after one second, and then after five."""
+
+REACH_S = 1.0
+"""For a connection; a master on our own network takes a hundredth of it, a board that is busy ten times that."""
+
+VAIN_S = 30.0
+"""Where a master was tried in vain it is not tried again so soon."""
+
+TELL_S = 10.0
+"""Between lines in the journal about what is found; anyone on the network could have us write them."""
+
+FILE_NAME = "master.json"
+
+
+class MasterSearch:
+    """Where the master is. Whoever talks to it says whether it answers; `run` looks for another when it does not."""
+
+    def __init__(self, config: UnitConfig) -> None:
+        """Reads files, so make it before the event loop runs.
+
+        Raises:
+            ConfigError: `master_ca` cannot be read or holds no certificate.
+        """
+        self._wanted = wanted_of(config)
+        self._source_address = config.source_address
+        self._path = config.state_dir / FILE_NAME
+        self._kept = kept_of(config)
+        self._tls = config.tls() or tls_context()
+        self._place = first_place(self._wanted, self._kept)
+        self._found = asyncio.Event()
+        self._lost = asyncio.Event()
+        self._silent_since_ns: int | None = None
+        self._answered_once = False
+        self._vain: dict[str, int] = {}
+        self._cells: set[str] = set()
+        self._told = ""
+        self._told_at_ns = monotonic_ns() - round(TELL_S * NS_PER_S)
+        self.outcome = "no master is configured, and none was known before"
+        """What was found last, in words."""
+        if self._place is None:
+            self._lost.set()
+
+    @property
+    def lost(self) -> bool:
+        """Whether it looks."""
+        return self._lost.is_set()
+
+    async def place(self) -> Place:
+        """Where to turn to now; waits while nobody knows."""
+        while self._place is None:
+            self._found.clear()
+            await self._found.wait()
+        return self._place
+
+    def answered(self, url: str) -> None:
+        """The master at `url` answers."""
+        if self._place is not None and self._place.url == url:
+            self._silent_since_ns = None
+            self._answered_once = True
+            self._lost.clear()
+
+    async def keep(self, url: str, cell: str) -> None:
+        """The master at `url` has taken us in, and watches `cell`: the one to return to, also after a restart."""
+        if self._place is None or self._place.url != url:
+            return
+        kept = Kept(url, cell, self._place.found_by, self._wanted.url)
+        before, self._kept = self._kept, kept
+        if before is None or (before.url, before.cell, before.configured) != (kept.url, kept.cell, kept.configured):
+            await asyncio.to_thread(save_kept, self._path, kept)
+
+    def unanswered(self, now_ns: int) -> None:
+        """The master does not answer, or is none for us."""
+        if self._silent_since_ns is None:
+            self._silent_since_ns = now_ns
+        elif now_ns - self._silent_since_ns >= LOST_S * NS_PER_S:
+            self._lost.set()
+
+    async def run(self) -> None:
+        """Look whenever it is lost, until cancelled."""
+        while True:
+            await self._lost.wait()
+            began_ns = none_since_ns = monotonic_ns()
+            async with Browser() as browser:
+                while self.lost:
+                    browser.changed.clear()
+                    offers, now_ns = await browser.offers(), monotonic_ns()
+                    if not offers:
+                        none_since_ns = now_ns
+                    hear_s = HEAR_FIRST_S if self._any_cell else HEAR_S
+                    heard = now_ns - (none_since_ns if offers else began_ns) >= hear_s * NS_PER_S
+                    await self._look(offers if heard else None)
+                    if self.lost:
+                        await within(LOOK_S if heard else HEAR_S, browser.changed.wait())
+
+    async def _look(self, offers: Sequence[Offer] | None) -> None:
+        """Take another place, if there is one that will do; None: it is too early to choose among offers."""
+        now_ns = monotonic_ns()
+        self._vain = {url: at_ns for url, at_ns in self._vain.items() if now_ns - at_ns < VAIN_S * NS_PER_S}
+        before = [first_place(self._wanted, None), first_place(Wanted(), self._kept)]
+        for place in before:
+            if place is not None and self._new(place.url) and not await self._reach(place.url):
+                self._take(place)
+                return
+        if offers is None:
+            return
+        tried = [url for offer in offers for url in offer.urls if not self._new(url)]
+        candidates = await judged(offers, self._wanted, self._kept, self._tls, self._source_address, tried)
+        if self._any_cell and len(self._cells) < MAX_OFFERS:
+            # Who is not believed counts for nothing; who is merely slow to answer is there nevertheless.
+            ours = [one.offer for one in candidates if one.url is not None] if self._wanted.checked else offers
+            self._cells |= {one.says.cell for one in ours if objection(one, self._wanted, self._kept) is None}
+        chosen, self.outcome = choose(candidates, self._cells)
+        if chosen is not None and chosen.url is not None:
+            self._take(Place(chosen.url, self.outcome))
+        elif now_ns - self._told_at_ns >= TELL_S * NS_PER_S and self.outcome != self._told:
+            logger.info("%s", self.outcome)
+            self._told, self._told_at_ns = self.outcome, now_ns
+
+    @property
+    def _any_cell(self) -> bool:
+        """Whether nothing says which cell's master is ours."""
+        return self._kept is None and self._wanted.cell is None
+
+    async def _reach(self, url: str) -> str | None:
+        return await reach(url, self._tls, self._source_address)
+
+    def _new(self, url: str) -> bool:
+        """Whether it is worth a try: neither where we are, nor where we were in vain a moment ago."""
+        return url not in self._vain and (self._place is None or url != self._place.url)
+
+    def _take(self, place: Place) -> None:
+        if self._place is not None and not self._answered_once:
+            self._vain[self._place.url] = monotonic_ns()
+        self._place = place
+        self._silent_since_ns = None
+        self._answered_once = False
+        self._lost.clear()
+        self._found.set()
+
+
+def wanted_of(config: UnitConfig) -> Wanted:
+    """What a configuration says of the master."""
+    url = None if config.master_url is None else config.master_url.rstrip("/")
+    return Wanted(url, config.cell, config.checks_master, config.master_fingerprint)
+
+
+def kept_of(config: UnitConfig) -> Kept | None:
+    """The master that took this unit in last, if the configuration still lets it go there."""
+    kept = load_kept(config.state_dir / FILE_NAME)
+    return None if kept is None or distrusted(kept, wanted_of(config)) else kept
+
+
+async def judged(
+    offers: Sequence[Offer],
+    wanted: Wanted,
+    kept: Kept | None,
+    tls: ssl.SSLContext,
+    source_address: str | None,
+    passed_over: Sequence[str] = (),
+) -> list[Candidate]:
+    """Each offer with what speaks against it, or where it was reached; URLs in `passed_over` are not tried."""
+    own = own_addresses()
+
+    async def candidate(offer: Offer) -> Candidate:
+        against = objection(offer, wanted, kept)
+        if against is not None:
+            return Candidate(offer, None, against)
+        against = "it was tried in vain"
+        for url in in_order([url for url in offer.urls if url not in passed_over], own):
+            failure = await reach(url, tls, source_address)
+            if failure is None:
+                return Candidate(offer, url)
+            against = failure
+        return Candidate(offer, None, against)
+
+    return list(await asyncio.gather(*map(candidate, offers)))
+
+
+async def reach(url: str, tls: ssl.SSLContext, source_address: str | None) -> str | None:
+    """Why nobody is at `url` who passes for a master, or None; nothing is sent but a handshake."""
+    parts = urlsplit(url)
+    local = None if source_address is None else (source_address, 0)
+
+    async def connect() -> None:
+        _, writer = await asyncio.open_connection(
+            parts.hostname, parts.port, ssl=tls if parts.scheme == "https" else None, local_addr=local
+        )
+        writer.transport.abort()
+
+    try:
+        return None if await within(REACH_S, connect()) else f"it does not answer within {REACH_S:g} s"
+    except OSError as error:
+        return f"it cannot be reached: {str(error) or type(error).__name__}"
+
+
+def load_kept(path: Path) -> Kept | None:
+    """The master that answered last, or None; a damaged file is as good as none."""
+    return StateFile(path).load(_kept_of_document)
+
+
+def save_kept(path: Path, kept: Kept) -> None:
+    """Remember a master; where nothing can be written nothing is remembered, and a warning says so."""
+    StateFile(path).save(dataclasses.asdict(kept))
+
+
+def _kept_of_document(document: Any) -> Kept:
+    configured = document["configured"]
+    kept = Kept(
+        str(document["url"]),
+        str(document["cell"]),
+        str(document["found_by"]),
+        None if configured is None else str(configured),
+    )
+    parts = urlsplit(kept.url)
+    if parts.scheme not in ("http", "https") or not parts.hostname or parts.port is None:
+        raise ValueError(f"expected http://host:port, got {kept.url[:80]!r}")
+    return kept

@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Voxels with too few points are noise (the paper's Algorithms 6 and 7, and our departure).
+
+The paper deletes each voxel that holds less than a share of the points that a full one would show at its
+distance; a flat hand on a border is thus split into two halves and disappears. Here the points of the 27 voxels
+around decide, and a voxel by itself only needs a small share.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.kernels.jit import kernel
+
+FLOOR_VOXELS = 3.0
+"""The floor of points never asks for more than this many full voxels: small voxels far away hold few points, and a
+surface that crosses the neighbourhood fills about nine."""
+
+AT_ONCE = 256
+"""So many voxels are located before they are judged: enough for the vectoriser, and they stay in the first cache."""
+
+
+@kernel
+def expected_pinhole(size_m: float, z_m: float, fx: float, fy: float) -> float:
+    """Points that a square of `size_m` facing the camera at depth `z_m` shows."""
+    side = size_m / max(z_m, 1e-3)
+    return fx * fy * side * side
+
+
+@kernel
+def expected_angular(size_m: float, distance_m: float, degrees_per_column: float, degrees_per_row: float) -> float:
+    """The paper's Algorithm 6: the same from degrees per pixel, averaged over the whole view."""
+    angle_deg = math.degrees(math.atan(size_m / max(distance_m, 1e-3)))
+    return (angle_deg / degrees_per_column) * (angle_deg / degrees_per_row)
+
+
+@kernel
+def neighbourhood_count(
+    counts: NDArray[np.uint32], slot: np.uint64, slots_per_y: np.uint64, slots_per_x: np.uint64
+) -> int:
+    """Points in the 27 voxels around a slot of the counter with its rim, see `voxelize`."""
+    total = np.uint32(0)
+    for jx in range(3):
+        for jy in range(3):
+            first = slot + np.uint64(jx) * slots_per_x + np.uint64(jy) * slots_per_y
+            first -= slots_per_x + slots_per_y + np.uint64(1)
+            total += counts[first] + counts[first + np.uint64(1)] + counts[first + np.uint64(2)]
+    return total  # type: ignore[return-value]  # to numba it is a plain number
+
+
+@kernel
+def locate(
+    slots: NDArray[np.uint32],
+    shape: NDArray[np.int32],
+    first_centre_camera_m: NDArray[np.float64],
+    axes_camera: NDArray[np.float64],
+    keys: NDArray[np.uint32],
+    z_m: NDArray[np.float64],
+    distance_m: NDArray[np.float64],
+) -> None:
+    """Of each of a few slots the key of its voxel, and the depth and distance of the voxel's middle from the camera.
+
+    Written for the vectoriser: without divisions of integers, which it cannot do. A slot is below 2**28: the half that
+    is added outweighs the rounding of the inverse.
+    """
+    ny, nz = np.float64(shape[1]), np.float64(shape[2])
+    per_z, per_y = 1.0 / (nz + 2.0), 1.0 / (ny + 2.0)
+    x0, y0, z0 = first_centre_camera_m[0], first_centre_camera_m[1], first_centre_camera_m[2]
+    xx, xy, xz = axes_camera[0, 0], axes_camera[0, 1], axes_camera[0, 2]
+    yx, yy, yz = axes_camera[1, 0], axes_camera[1, 1], axes_camera[1, 2]
+    zx, zy, zz = axes_camera[2, 0], axes_camera[2, 1], axes_camera[2, 2]
+    for i in range(len(slots)):
+        slot = np.float64(slots[i])
+        row = np.floor((slot + 0.5) * per_z)
+        plane = np.floor((row + 0.5) * per_y)
+        iz = slot - row * (nz + 2.0) - 1.0
+        iy = row - plane * (ny + 2.0) - 1.0
+        ix = plane - 1.0
+        keys[i] = np.uint32((ix * ny + iy) * nz + iz)
+        x = x0 + xx * ix + xy * iy + xz * iz
+        y = y0 + yx * ix + yy * iy + yz * iz
+        z = z0 + zx * ix + zy * iy + zz * iz
+        z_m[i] = z
+        distance_m[i] = math.sqrt(x * x + y * y + z * z)
+
+
+@kernel
+def fill_pinhole(size_m: float, z_m: NDArray[np.float64], fx: float, fy: float, full: NDArray[np.float64]) -> None:
+    """`expected_pinhole` of each; alone in its function, it is vectorised."""
+    for i in range(len(z_m)):
+        full[i] = expected_pinhole(size_m, z_m[i], fx, fy)
+
+
+@kernel
+def fill_angular(
+    size_m: float,
+    distance_m: NDArray[np.float64],
+    degrees_per_column: float,
+    degrees_per_row: float,
+    full: NDArray[np.float64],
+) -> None:
+    """`expected_angular` of each."""
+    for i in range(len(distance_m)):
+        full[i] = expected_angular(size_m, distance_m[i], degrees_per_column, degrees_per_row)
+
+
+@kernel
+def demand(
+    full: NDArray[np.float64],
+    single: bool,
+    threshold: float,
+    share: float,
+    points_min: float,
+    own_share_min: float,
+    own_needed: NDArray[np.float64],
+    needed: NDArray[np.float64],
+) -> None:
+    """What a voxel must hold by itself, and with its 26 neighbours; `share` of a full one is asked at most."""
+    own_share = threshold if single else own_share_min
+    around_share = 0.0 if single else threshold * share
+    floor_points, floor_voxels = (0.0, 0.0) if single else (points_min, FLOOR_VOXELS)
+    for i in range(len(full)):
+        own_needed[i] = own_share * full[i]
+        needed[i] = max(around_share * full[i], min(floor_points, floor_voxels * full[i]))
+
+
+@kernel
+def sum_around(
+    counts: NDArray[np.uint32],
+    slots: NDArray[np.uint32],
+    slots_per_y: np.uint64,
+    slots_per_x: np.uint64,
+    around: NDArray[np.float64],
+) -> None:
+    """`neighbourhood_count` of each; apart from the decision, so that no wrong guess of it stops the loads."""
+    for i in range(len(slots)):
+        around[i] = neighbourhood_count(counts, np.uint64(slots[i]), slots_per_y, slots_per_x)
+
+
+@kernel
+def pick(
+    counts: NDArray[np.uint32],
+    slots: NDArray[np.uint32],
+    keys: NDArray[np.uint32],
+    around: NDArray[np.float64],
+    own_needed: NDArray[np.float64],
+    needed: NDArray[np.float64],
+    kept: NDArray[np.uint32],
+    kept_counts: NDArray[np.uint32],
+) -> int:
+    """List the keys and counts of those `slots` that hold what is needed; returns how many."""
+    # Unsigned, for a signed index is tested for counting from the end.
+    number = np.uint64(0)
+    for i in range(len(slots)):
+        own = counts[slots[i]]
+        # Written always and kept when it is dense: a branch would be guessed wrong too often.
+        kept[number] = keys[i]
+        kept_counts[number] = own
+        number += np.uint64((own >= own_needed[i]) & (around[i] >= needed[i]))
+    return np.int64(number)  # type: ignore[return-value]  # to numba it is a plain number
+
+
+@kernel
+def keep_dense(
+    counts: NDArray[np.uint32],
+    touched: NDArray[np.uint32],
+    found: int,
+    shape: NDArray[np.int32],
+    voxel_size_m: float,
+    first_centre_camera_m: NDArray[np.float64],
+    axes_camera: NDArray[np.float64],
+    fx: float,
+    fy: float,
+    degrees_per_column: float,
+    degrees_per_row: float,
+    angular: bool,
+    single: bool,
+    threshold: float,
+    own_share_min: float,
+    support_area_max_m2: float,
+    support_points_min: float,
+    scratch: NDArray[np.float64],
+    keys: NDArray[np.uint32],
+    kept: NDArray[np.uint32],
+    kept_counts: NDArray[np.uint32],
+) -> int:
+    """List the touched voxels that are dense enough: their keys in `kept`, in the order of `touched`; returns how many.
+
+    `touched` are slots of the counter with its rim; in ascending order, neighbours are found in the cache.
+    `first_centre_camera_m` (3,) is the middle of voxel (0, 0, 0) in the camera frame and `axes_camera` (3, 3) has as
+    columns the steps to the next voxel along each lattice axis. `single` is the paper's Algorithm 7: a voxel's own
+    count against `threshold` of the full count. Else the 27-neighbourhood is held against `threshold` of the full count
+    of at most `support_area_max_m2`, but no less than `support_points_min` or `FLOOR_VOXELS` full voxels, and the
+    voxel's own against `own_share_min`. Out: `kept` and `kept_counts`, at least one longer than `found`.
+    `scratch` (6, AT_ONCE), `keys` (AT_ONCE,).
+    """
+    slots_per_y = np.uint64(shape[2] + 2)
+    slots_per_x = slots_per_y * np.uint64(shape[1] + 2)
+    share = min(support_area_max_m2 / (voxel_size_m * voxel_size_m), 1.0)
+    z_m, distance_m, full = scratch[0], scratch[1], scratch[2]
+    own_needed, needed, around = scratch[3], scratch[4], scratch[5]
+    number = 0
+    for first in range(0, found, AT_ONCE):
+        slots = touched[first : min(first + AT_ONCE, found)]
+        count = len(slots)
+        locate(slots, shape, first_centre_camera_m, axes_camera, keys, z_m, distance_m)
+        if angular:
+            fill_angular(voxel_size_m, distance_m[:count], degrees_per_column, degrees_per_row, full)
+        else:
+            fill_pinhole(voxel_size_m, z_m[:count], fx, fy, full)
+        demand(full[:count], single, threshold, share, support_points_min, own_share_min, own_needed, needed)
+        sum_around(counts, slots, slots_per_y, slots_per_x, around)
+        number += pick(counts, slots, keys, around, own_needed, needed, kept[number:], kept_counts[number:])
+    return number

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Expected depth less margins, as raw depth that a measured pixel is compared with.
+
+Limits are uint16 in the camera's own units, so that the filter compares without converting.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.kernels.jit import kernel
+from geometry.kernels.rasterize import NOTHING_FARTHEST, NOTHING_NEAREST, span_of_row
+
+RAW_MAX = 65535
+"""The largest raw depth."""
+
+ZERO, ONE, TOP = np.float32(0.0), np.float32(1.0), np.float32(RAW_MAX)
+"""In float32, for one float64 among them would halve what the vector unit does at once."""
+
+
+@kernel
+def less_noise(z_m: float, noise_m: float) -> float:
+    """Depth `z_m` less a noise that was reckoned there, taken off where it is symmetric: in disparity, that is in 1/z.
+
+    For small noise it is `z - noise`. Far away that would fall below 0, for noise grows with the square of depth,
+    and a wall at the end of the hall would hide who stands before the camera.
+    """
+    return z_m * z_m / (z_m + noise_m)
+
+
+@kernel
+def static_limit_raw(
+    cad_w: NDArray[np.float32],
+    reference_m: NDArray[np.float32],
+    spread_m: NDArray[np.float32],
+    cad_base_m: float,
+    cad_noise_per_m: float,
+    reference_base_m: float,
+    reference_gain: float,
+    range_max_m: float,
+    depth_scale_m: float,
+    limit_raw: NDArray[np.uint16],
+) -> None:
+    """Per pixel, the raw depth at which what is measured is no longer nearer than all that stands still.
+
+    The nearer of the CAD surface, less `base + noise * z**2` with `cad_w` = 1/z (H, W), and the learned surface,
+    less `base + gain * spread` with `reference_m`, `spread_m` (H, W), NaN where nothing was learned;
+    `range_max_m` where neither is known. Out: `limit_raw` (H, W), rounded down.
+    """
+    height, width = limit_raw.shape
+    for y in range(height):
+        for x in range(width):
+            limit_m = range_max_m
+            w = cad_w[y, x]
+            if w > 0.0:
+                z = 1.0 / w
+                limit_m = min(limit_m, less_noise(z, cad_noise_per_m * z * z) - cad_base_m)
+            learned = reference_m[y, x]
+            if learned == learned:
+                limit_m = min(limit_m, less_noise(learned, reference_gain * spread_m[y, x]) - reference_base_m)
+            limit_raw[y, x] = np.uint16(min(max(math.floor(limit_m / depth_scale_m), 0), RAW_MAX))
+
+
+@kernel
+def nearest_over(
+    image: NDArray[np.uint16], radius_px: int, scratch: NDArray[np.uint16], out: NDArray[np.uint16]
+) -> None:
+    """Minimum over the square of `radius_px` around each pixel, (H, W); `scratch` (H, W)."""
+    height, width = image.shape
+    for y in range(height):
+        for x in range(width):
+            nearest = image[y, x]
+            for k in range(max(x - radius_px, 0), min(x + radius_px, width - 1) + 1):
+                nearest = min(nearest, image[y, k])
+            scratch[y, x] = nearest
+    for y in range(height):
+        for x in range(width):
+            out[y, x] = scratch[y, x]
+        for k in range(max(y - radius_px, 0), min(y + radius_px, height - 1) + 1):
+            for x in range(width):
+                out[y, x] = min(out[y, x], scratch[k, x])
+
+
+@kernel
+def empty_row(near_raw: NDArray[np.uint16], span_raw: NDArray[np.uint16], first: int, end: int) -> None:
+    """No band from column `first` to before `end`."""
+    if first < end:
+        near_raw[first:end] = np.uint16(RAW_MAX)
+        span_raw[first:end] = np.uint16(0)
+
+
+@kernel
+def band_of_row(
+    nearest_w: NDArray[np.float32],
+    farthest_w: NDArray[np.float32],
+    noise_per_m: np.float32,
+    depth_m: np.float32,
+    units_per_m: np.float32,
+    near_raw: NDArray[np.uint16],
+    span_raw: NDArray[np.uint16],
+) -> None:
+    """One stretch of a row of `robot_band_raw`; written for the vectoriser: no branch, one type, nothing but arrays."""
+    for i in range(len(nearest_w)):
+        nearest, farthest = nearest_w[i], farthest_w[i]
+        # A back without a front: the front lies before the near plane, and the camera in the padding.
+        within = (nearest == NOTHING_NEAREST) & (farthest > NOTHING_FARTHEST)
+        z_near = ZERO if within else ONE / nearest
+        z_far = max(-ONE / farthest, z_near + depth_m)
+        near = min(max((z_near - noise_per_m * z_near * z_near) * units_per_m, ZERO), TOP)
+        far = min(max((z_far + noise_per_m * z_far * z_far) * units_per_m, ZERO), TOP)
+        low = np.int32(near)
+        # Where nothing was drawn the above is nonsense.
+        drawn = (nearest > NOTHING_NEAREST) | within
+        near_raw[i] = np.uint16(low) if drawn else np.uint16(RAW_MAX)
+        span_raw[i] = np.uint16(np.int32(far) - low) if drawn else np.uint16(0)
+
+
+@kernel
+def robot_band_raw(
+    window: NDArray[np.int64],
+    nearest_w: NDArray[np.float32],
+    farthest_w: NDArray[np.float32],
+    rectangles: NDArray[np.int32],
+    links: NDArray[np.bool_],
+    noise_per_m: float,
+    depth_m: float,
+    depth_scale_m: float,
+    near_raw: NDArray[np.uint16],
+    span_raw: NDArray[np.uint16],
+    columns: NDArray[np.int32],
+) -> None:
+    """The band of raw depths in which a measurement belongs to the robot, as `rasterize.draw_meshes` has drawn it.
+
+    From the nearest padded surface less its noise margin, or from 0 where the camera stands in the padding, to the
+    farthest one, or `depth_m` behind the nearest if that is farther, plus the margin there: what stands behind the
+    robot is still seen. The band
+    is stored as its lower end and its length, so that the filter needs one unsigned compare. Where there is no robot
+    it is empty: its lower end is where no limit reaches. `columns` (H, 2) holds of each row the first column and the
+    one after the last that the images `near_raw` and `span_raw` (H, W) have a band in; it is renewed, and what was
+    there before is made empty.
+    """
+    noise = np.float32(noise_per_m)
+    depth = np.float32(depth_m)
+    units = np.float32(1.0 / depth_scale_m)
+    for y in range(len(near_raw)):
+        first, end = 0, 0
+        if window[0] <= y < window[0] + window[2]:
+            first, end = span_of_row(y, rectangles, links, links)
+        if columns[y, 0] < columns[y, 1]:
+            empty_row(near_raw[y], span_raw[y], columns[y, 0], min(columns[y, 1], first))
+            empty_row(near_raw[y], span_raw[y], max(columns[y, 0], end), columns[y, 1])
+        columns[y, 0], columns[y, 1] = first, end
+        if first < end:
+            at = (y - window[0]) * window[3] - window[1]
+            band_of_row(
+                nearest_w[at + first : at + end],
+                farthest_w[at + first : at + end],
+                noise,
+                depth,
+                units,
+                near_raw[y, first:end],
+                span_raw[y, first:end],
+            )
+
+
+@kernel
+def clear_band(near_raw: NDArray[np.uint16], span_raw: NDArray[np.uint16], columns: NDArray[np.int32]) -> None:
+    """Make the band of `robot_band_raw` empty everywhere."""
+    for y in range(len(near_raw)):
+        empty_row(near_raw[y], span_raw[y], columns[y, 0], columns[y, 1])
+        columns[y, 0], columns[y, 1] = 0, 0
+
+
+@kernel
+def lower_row(nearest_w: NDArray[np.float32], depth_m: NDArray[np.float32]) -> None:
+    """One stretch of a row of `lower_depth`; written for the vectoriser."""
+    for i in range(len(nearest_w)):
+        # Where nothing was drawn w is 0 and its inverse infinite.
+        depth_m[i] = min(depth_m[i], ONE / nearest_w[i])
+
+
+@kernel
+def lower_depth(
+    window: NDArray[np.int64],
+    nearest_w: NDArray[np.float32],
+    rectangles: NDArray[np.int32],
+    links: NDArray[np.bool_],
+    depth_m: NDArray[np.float32],
+) -> None:
+    """Lower `depth_m` (H, W) to what `rasterize.draw_meshes` has drawn where that is nearer."""
+    for y in range(window[0], window[0] + window[2]):
+        first, end = span_of_row(y, rectangles, links, links)
+        at = (y - window[0]) * window[3] - window[1]
+        lower_row(nearest_w[at + first : at + end], depth_m[y, first:end])

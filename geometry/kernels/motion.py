@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which links have moved since they were drawn, and which are therefore drawn again."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.kernels.jit import kernel
+
+STILL, MOVED, KEPT_CHANGES = 0, 1, 2
+"""What `settle` finds: no link moved; some did; and it is other links than before that stand still."""
+
+
+@kernel
+def settle(
+    poses: NDArray[np.float64],
+    padding_m: NDArray[np.float32],
+    reach_m: NDArray[np.float64],
+    still_m: float,
+    kept_after: int,
+    anew: bool,
+    drawn_poses: NDArray[np.float64],
+    drawn_padding_m: NDArray[np.float32],
+    still_for: NDArray[np.int64],
+    is_kept: NDArray[np.bool_],
+    is_drawn: NDArray[np.bool_],
+) -> int:
+    """Compare the `poses` (L, 4, 4) and the padding (L,) of links with those at which they were drawn.
+
+    A link moved when a vertex `reach_m` (L,) from its origin may have moved by more than `still_m`. When none did
+    nothing is changed, unless all must be drawn `anew`. Else `still_for` (L,) counts the drawings since each moved, and
+    once a kept link moves, or another has been still for `kept_after`, those that are so long still are the kept ones.
+    Out: `is_kept`, and `is_drawn` for the others (L,); pose and padding of what will be drawn now.
+    """
+    still_before = True
+    for m in range(len(poses)):
+        moved_m = abs(np.float64(padding_m[m]) - np.float64(drawn_padding_m[m]))
+        for i in range(3):
+            moved_m += abs(poses[m, i, 3] - drawn_poses[m, i, 3])
+            for j in range(3):
+                moved_m += abs(poses[m, i, j] - drawn_poses[m, i, j]) * reach_m[m]
+        # Nowhere was it drawn when this is not a number.
+        is_drawn[m] = not moved_m <= still_m
+        still_before = still_before and not is_drawn[m]
+    if still_before and not anew:
+        return STILL
+    found = MOVED
+    for m in range(len(poses)):
+        still_for[m] = 0 if is_drawn[m] else still_for[m] + 1
+        if (is_kept[m] and is_drawn[m]) or (not is_kept[m] and still_for[m] >= kept_after):
+            found = KEPT_CHANGES
+    for m in range(len(poses)):
+        if found == KEPT_CHANGES:
+            is_kept[m] = still_for[m] >= kept_after
+        is_drawn[m] = not is_kept[m]
+        if is_drawn[m] or found == KEPT_CHANGES:
+            drawn_poses[m] = poses[m]
+            drawn_padding_m[m] = padding_m[m]
+    return found

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A point and its place in the picture: the one projection of all kernels.
+
+Camera frames are optical: x to the right, y down, z forward. `T_a_b` (4, 4) maps points of frame b into frame a.
+Pixel centres are at integer coordinates: pixel (u, v), column and row, reaches from u - 0.5 to u + 0.5, and the picture
+from -0.5 to width - 0.5. `fx`, `fy`, `cx`, `cy` are in pixels. Points are in metres, or all in units of raw depth with
+the translation of `T_a_b` in these, for only their ratio counts. Inverse depth is `w = 1/z`, in 1/m or 1/raw.
+
+Each of these functions reckons in the type of what it is given, is inlined, and has no branch: a loop about it is
+vectorised.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.kernels.jit import kernel
+
+Real = TypeVar("Real", float, np.float32)
+
+Rows: TypeAlias = tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real, Real, Real, Real]
+"""The first three rows of a rigid transform, one after the other: as scalars they stay in registers."""
+
+
+@kernel
+def rows_of(T_a_b: NDArray[np.float64]) -> Rows[float]:
+    """The rows of a transform (4, 4), for `moved`."""
+    t = T_a_b
+    return (
+        t[0, 0], t[0, 1], t[0, 2], t[0, 3],
+        t[1, 0], t[1, 1], t[1, 2], t[1, 3],
+        t[2, 0], t[2, 1], t[2, 2], t[2, 3],
+    )  # fmt: skip
+
+
+@kernel
+def rows_of_32(T_a_b: NDArray[np.float64]) -> Rows[np.float32]:
+    """The same in float32."""
+    t = T_a_b
+    return (
+        np.float32(t[0, 0]), np.float32(t[0, 1]), np.float32(t[0, 2]), np.float32(t[0, 3]),
+        np.float32(t[1, 0]), np.float32(t[1, 1]), np.float32(t[1, 2]), np.float32(t[1, 3]),
+        np.float32(t[2, 0]), np.float32(t[2, 1]), np.float32(t[2, 2]), np.float32(t[2, 3]),
+    )  # fmt: skip
+
+
+@kernel
+def moved(rows_a_b: Rows[Real], x: Real, y: Real, z: Real) -> tuple[Real, Real, Real]:
+    """A point of frame b in frame a."""
+    r = rows_a_b
+    return (
+        r[0] * x + r[1] * y + r[2] * z + r[3],
+        r[4] * x + r[5] * y + r[6] * z + r[7],
+        r[8] * x + r[9] * y + r[10] * z + r[11],
+    )
+
+
+@kernel
+def project(x: Real, y: Real, w: Real, fx: Real, fy: Real, cx: Real, cy: Real) -> tuple[Real, Real]:
+    """Pixel coordinates u and v of a point of the camera frame whose inverse depth is `w`."""
+    return x * w * fx + cx, y * w * fy + cy
+
+
+@kernel
+def deproject(u: float, v: float, z: float, fx: float, fy: float, cx: float, cy: float) -> tuple[float, float, float]:
+    """The point of the camera frame at depth `z` that pixel coordinates u and v show."""
+    return (u - cx) / fx * z, (v - cy) / fy * z, z
+
+
+@kernel
+def nearest_pixel(u_or_v: Real) -> int:
+    """The column or row whose centre is nearest to a pixel coordinate, of two the higher."""
+    return np.int64(np.floor(u_or_v + np.float32(0.5)))  # type: ignore[return-value]  # to numba it is a plain number

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which blocks of the cell a frame looks through.
+
+A block is seen when enough of the rays through it are measured at or beyond its far side, and when its far side
+is nearer than everything that could hide an obstacle: the static limit and the robot's band.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.kernels.jit import kernel
+from geometry.kernels.pinhole import moved, project, rows_of
+
+RAYS_PER_SIDE = 6
+"""A block is probed by a grid of about 6 x 6 of its pixels: 5 % of them decide nothing, and it costs little."""
+
+
+BLOCKED_MAX = 1
+"""Rays that may end before a block's far side: one is noise, more may be a finger that is too thin to be reported."""
+
+
+@kernel
+def block_views(
+    shape: NDArray[np.int32],
+    block_size_m: float,
+    T_camera_world: NDArray[np.float64],
+    origin_m: NDArray[np.float64],
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    width: int,
+    height: int,
+    near_m: float,
+    noise_per_m: float,
+    depth_scale_m: float,
+    blocks: NDArray[np.int32],
+    views: NDArray[np.int32],
+) -> int:
+    """List the blocks that lie wholly in the picture, with the rectangle that each covers; returns how many.
+
+    Blocks of `block_size_m` fill `shape` (3,) from `origin_m` (3,), numbered `(ix*ny + iy)*nz + iz`. Out, per listed
+    block: `blocks` its number; `views` (., 5) first and last row, first and last column, raw depth of its far corner
+    plus the noise `noise_per_m * z**2` there: what stands just inside may be measured that much behind.
+    """
+    rows = rows_of(T_camera_world)
+    number = 0
+    for ix in range(shape[0]):
+        for iy in range(shape[1]):
+            for iz in range(shape[2]):
+                u_low, u_high, v_low, v_high = 1e9, -1e9, 1e9, -1e9
+                z_low, z_high = 1e9, -1e9
+                for corner in range(8):
+                    wx = origin_m[0] + (ix + (corner & 1)) * block_size_m
+                    wy = origin_m[1] + (iy + ((corner >> 1) & 1)) * block_size_m
+                    wz = origin_m[2] + (iz + (corner >> 2)) * block_size_m
+                    x, y, z = moved(rows, wx, wy, wz)
+                    z_low = min(z_low, z)
+                    z_high = max(z_high, z)
+                    if z < near_m:
+                        break
+                    u, v = project(x, y, 1.0 / z, fx, fy, cx, cy)
+                    u_low, u_high = min(u_low, u), max(u_high, u)
+                    v_low, v_high = min(v_low, v), max(v_high, v)
+                far_raw = math.ceil((z_high + noise_per_m * z_high * z_high) / depth_scale_m)
+                if z_low < near_m or far_raw > 65535 or u_low < 0.0 or v_low < 0.0:
+                    continue
+                if u_high > width - 1 or v_high > height - 1:
+                    continue
+                blocks[number] = (ix * shape[1] + iy) * shape[2] + iz
+                views[number, 0] = math.floor(v_low)
+                views[number, 1] = math.ceil(v_high)
+                views[number, 2] = math.floor(u_low)
+                views[number, 3] = math.ceil(u_high)
+                views[number, 4] = far_raw
+                number += 1
+    return number
+
+
+@kernel
+def reach_of_row(
+    depth_raw: NDArray[np.uint16],
+    static_limit_raw: NDArray[np.uint16],
+    robot_near_raw: NDArray[np.uint16],
+    reach_raw: NDArray[np.uint16],
+) -> None:
+    """How far each ray of a row is sure to pass; written for the vectoriser."""
+    for x in range(len(reach_raw)):
+        reach_raw[x] = min(depth_raw[x], min(static_limit_raw[x], robot_near_raw[x]))
+
+
+@kernel
+def passes(
+    reach_raw: NDArray[np.uint16],
+    first_row: int,
+    last_row: int,
+    first_column: int,
+    last_column: int,
+    far_raw: int,
+    share_min: float,
+) -> bool:
+    """Whether at least `share_min` of the rays that are probed inside a rectangle reach `far_raw`.
+
+    Of the others any may be unmeasured, but at most `BLOCKED_MAX` may end before it: a thin thing blocks few.
+    """
+    row_step = max((last_row - first_row) // RAYS_PER_SIDE, 1)
+    column_step = np.uint64(max((last_column - first_column) // RAYS_PER_SIDE, 1))
+    rows = (last_row - first_row) // row_step + 1
+    columns = (last_column - first_column) // np.int64(column_step) + 1
+    probed = rows * columns
+    needed = share_min * probed
+    far = np.uint16(far_raw)
+    possible = probed
+    blocked = 0
+    for y in range(first_row, last_row + 1, row_step):
+        row = reach_raw[y]
+        x = np.uint64(first_column)
+        for _ in range(columns):
+            possible -= int(row[x] < far)
+            # Between 1 and far, by one unsigned compare.
+            blocked += int(np.uint16(row[x] - np.uint16(1)) < np.uint16(far - np.uint16(1)))
+            x += column_step
+        # Most blocks are seen wholly or not at all.
+        if possible < needed or blocked > BLOCKED_MAX:
+            return False
+    return True
+
+
+@kernel
+def seen_blocks(
+    depth_raw: NDArray[np.uint16],
+    static_limit_raw: NDArray[np.uint16],
+    robot_near_raw: NDArray[np.uint16],
+    blocks: NDArray[np.int32],
+    views: NDArray[np.int32],
+    number: int,
+    share_min: float,
+    rows_apart: int,
+    reach_raw: NDArray[np.uint16],
+    seen: NDArray[np.uint8],
+) -> None:
+    """Set `seen` (all blocks,) to 1 for the blocks through which at least `share_min` of the probed rays pass, else 0.
+
+    Images are (H, W); `blocks` and `views` are those of `block_views`, of which `number` count. Only every
+    `rows_apart`-th row is looked at. Scratch: `reach_raw` (H / rows_apart, rounded up, W).
+    """
+    for y in range(len(reach_raw)):
+        row = y * rows_apart
+        # An unmeasured pixel has depth 0 and passes nothing.
+        reach_of_row(depth_raw[row], static_limit_raw[row], robot_near_raw[row], reach_raw[y])
+    seen[:] = 0
+    for i in range(number):
+        first_row, last_row = views[i, 0] // rows_apart, views[i, 1] // rows_apart
+        seen[blocks[i]] = passes(reach_raw, first_row, last_row, views[i, 2], views[i, 3], views[i, 4], share_min)

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Foreground pixels counted on the lattice (the paper's Algorithm 1, with its rounding mended).
+
+The counter is dense and has a rim of one empty voxel all around, so that whoever looks at a voxel's neighbours needs
+no test for the lattice's end. A *slot* is a place in it: that of voxel (ix, iy, iz) of a lattice (nx, ny, nz) is
+`((ix + 1) * (ny + 2) + iy + 1) * (nz + 2) + iz + 1`. One more slot behind the last takes what lies outside.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.kernels.jit import kernel
+
+PIXELS_PER_WORD = 8
+"""A row of the mask is read as words of 64 bits: eight empty pixels are skipped at once."""
+
+
+@kernel
+def slots_of_row(
+    depth_raw: NDArray[np.uint16],
+    mask: NDArray[np.uint8],
+    ray_x: NDArray[np.float32],
+    ray_y: NDArray[np.float32],
+    ray_z: NDArray[np.float32],
+    row_x: np.float32,
+    row_y: np.float32,
+    row_z: np.float32,
+    origin_x: np.float32,
+    origin_y: np.float32,
+    origin_z: np.float32,
+    limit_x: np.float32,
+    limit_y: np.float32,
+    limit_z: np.float32,
+    slots_per_y: np.int32,
+    slots_per_x: np.int32,
+    first_slot: np.int32,
+    outside: np.int32,
+    slots: NDArray[np.int32],
+) -> None:
+    """The slot of each pixel of a stretch of a row; written for the vectoriser: no branch, 32 bits, nothing but arrays.
+
+    `outside` for a pixel that is not marked and for a point outside the lattice.
+    """
+    zero = np.float32(0.0)
+    for i in range(len(depth_raw)):
+        d = np.float32(depth_raw[i])
+        gx = (ray_x[i] + row_x) * d + origin_x
+        gy = (ray_y[i] + row_y) * d + origin_y
+        gz = (ray_z[i] + row_z) * d + origin_z
+        # Below zero is dropped before truncation, so that truncation is floor.
+        inside = (gx >= zero) & (gy >= zero) & (gz >= zero) & (gx < limit_x) & (gy < limit_y) & (gz < limit_z)
+        slot = np.int32(np.int32(gx) * slots_per_x) + np.int32(np.int32(gy) * slots_per_y) + np.int32(gz)
+        slots[i] = np.int32(slot + first_slot) if inside & (mask[i] != 0) else outside
+
+
+@kernel
+def tally(slots: NDArray[np.int32], counts: NDArray[np.uint32], touched: NDArray[np.uint32], found: int) -> int:
+    """Count the `slots`, and list those that were empty behind the `found` that `touched` has; returns how many now."""
+    # Unsigned, for a signed index is tested for counting from the end.
+    end = np.uint64(found)
+    for i in range(len(slots)):
+        slot = np.uint32(slots[i])
+        count = counts[slot]
+        # Written always and kept when it was the first: a branch would be guessed wrong too often.
+        touched[end] = slot
+        end += np.uint64(count == 0)
+        counts[slot] = count + np.uint32(1)
+    return np.int64(end)  # type: ignore[return-value]  # to numba it is a plain number
+
+
+@kernel
+def next_marked(words: NDArray[np.uint64], start: int) -> int:
+    """The first word from `start` on that is not zero, or their number."""
+    # Unsigned, for a signed index is tested for counting from the end.
+    word, end = np.uint64(start), np.uint64(len(words))
+    one, two, three, four = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
+    while word + four <= end and words[word] | words[word + one] | words[word + two] | words[word + three] == 0:
+        word += four
+    while word < end and words[word] == 0:
+        word += one
+    return np.int64(word)  # type: ignore[return-value]  # to numba it is a plain number
+
+
+@kernel
+def next_empty(words: NDArray[np.uint64], start: int) -> int:
+    """The first word from `start` on that is zero, or their number."""
+    word, end = np.uint64(start), np.uint64(len(words))
+    while word < end and words[word] != 0:
+        word += np.uint64(1)
+    return np.int64(word)  # type: ignore[return-value]  # to numba it is a plain number
+
+
+@kernel
+def count_points(
+    depth_raw: NDArray[np.uint16],
+    mask_words: NDArray[np.uint64],
+    mask: NDArray[np.uint8],
+    column_rays: NDArray[np.float32],
+    row_rays: NDArray[np.float32],
+    origin: NDArray[np.float32],
+    shape: NDArray[np.int32],
+    slots: NDArray[np.int32],
+    counts: NDArray[np.uint32],
+    touched: NDArray[np.uint32],
+    found: int,
+) -> int:
+    """Deproject the marked pixels onto the lattice and count them; returns how many voxels were touched until now.
+
+    In units of voxels, with the camera's pose folded in: a pixel at column u, row v and raw depth d lies
+    at `(column_rays[:, u] + row_rays[v]) * d + origin`; `column_rays` (3, W), `row_rays` (H, 3), `origin` (3,).
+    `mask` (at least H, stride) is also handed in as `mask_words` (., stride / 8). `slots` (W,) is scratch.
+    `counts` has `(nx + 2) * (ny + 2) * (nz + 2) + 1` slots and is zero before the first call; slots that become
+    non-zero are listed in `touched` (one longer than the most that may be) behind the `found` that are there, and by
+    it `forget` makes them zero again.
+    """
+    height, width = depth_raw.shape
+    words = mask_words.shape[1]
+    slots_per_y = np.int32(shape[2] + 2)
+    slots_per_x = np.int32(slots_per_y * (shape[1] + 2))
+    first_slot = np.int32(slots_per_x + slots_per_y + 1)
+    outside = np.int32(len(counts) - 1)
+    # Never zero, so that it is never listed.
+    counts[outside] = 1
+    for y in range(height):
+        row = mask_words[y]
+        word = next_marked(row, 0)
+        while word < words:
+            first = PIXELS_PER_WORD * word
+            word = next_empty(row, word)
+            end = min(PIXELS_PER_WORD * word, width)
+            slots_of_row(
+                depth_raw[y, first:end],
+                mask[y, first:end],
+                column_rays[0, first:end],
+                column_rays[1, first:end],
+                column_rays[2, first:end],
+                row_rays[y, 0],
+                row_rays[y, 1],
+                row_rays[y, 2],
+                origin[0],
+                origin[1],
+                origin[2],
+                np.float32(shape[0]),
+                np.float32(shape[1]),
+                np.float32(shape[2]),
+                slots_per_y,
+                slots_per_x,
+                first_slot,
+                outside,
+                slots[first:end],
+            )
+            found = tally(slots[first:end], counts, touched, found)
+            word = next_marked(row, word)
+    return found
+
+
+@kernel
+def forget(counts: NDArray[np.uint32], touched: NDArray[np.uint32], found: int) -> None:
+    """Make the dense counter zero again, in proportion to what was touched."""
+    for i in range(found):
+        counts[touched[i]] = 0

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot's links as they stand before one camera, frame by frame."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geometry.kernels import forward
+from shared.kinematics import Robot
+from shared.transforms import Transform
+
+
+class Links:
+    """Poses of a robot's links in the camera frame, with all memory taken beforehand."""
+
+    def __init__(self, robot: Robot, T_camera_world: Transform) -> None:
+        self._robot = robot
+        self._T_camera_base = T_camera_world @ robot.T_world_base
+        self._table = robot.link_table
+        count = len(robot.links)
+        self._local = np.empty((4, 4))
+        self._bodies = np.empty((len(self._table.parent) + 1, 4, 4))
+        self._poses = np.empty((count, 4, 4))
+        self._displacement_m = np.empty(count)
+
+    def place(self, joints: ArrayLike) -> NDArray[np.float64]:
+        """`T_camera_link` (L, 4, 4) at joint positions (n,), rad or m; valid until the next call.
+
+        Raises:
+            InputError: wrong number of joints, or one is not finite.
+        """
+        table = self._table
+        forward.place_links(
+            np.array(self._robot.check_joints(joints)),
+            self._T_camera_base,
+            table.parent,
+            table.dof,
+            table.multiplier,
+            table.offset,
+            table.is_turning,
+            table.fixed,
+            table.sine,
+            table.versine,
+            table.shift,
+            table.body,
+            table.T_body_link,
+            self._local,
+            self._bodies,
+            self._poses,
+        )
+        return self._poses
+
+    def displacement_m(self, uncertainty: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far (L,) any point of each link moves at most from where it was placed when joints are off (n,).
+
+        Valid until the next call; see `Robot.displacement_m`.
+        """
+        table = self._table
+        forward.displace_links(
+            uncertainty,
+            table.dof,
+            table.multiplier,
+            table.is_turning,
+            table.axis,
+            table.chain,
+            table.corners,
+            self._bodies,
+            self._poses,
+            self._displacement_m,
+        )
+        return self._displacement_m

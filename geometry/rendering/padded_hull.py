@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A link as the solid that reaches its padding around it: what is drawn of the robot for the filter.
+
+CAD of robots is fine, full of parts that nobody sees, and seldom closed. The surface at some distance around it is
+smooth, closed and has few triangles, whatever the mesh was like.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import manifold3d
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.kernels import hull as kernels
+from shared.errors import InputError
+from shared.meshes import TriangleMesh
+
+logger = logging.getLogger(__name__)
+
+DISTANCE_MIN_M = 0.015
+"""A nearer hull would need a grid too fine for its size."""
+
+GRID_SHARE = 0.25
+"""Spacing of the grid in parts of the distance, which is the hull's narrowest bend."""
+
+GRID_NODES_MAX = 2_000_000
+"""8 MB of distances; for a larger link the grid is coarser."""
+
+SAMPLE_SHARE = 0.1
+"""Spacing of the points that stand for the mesh in parts of the distance; it changes that by less than a hundredth."""
+
+SIMPLIFY_MAX_M, SIMPLIFY_SHARE = 0.002, 1.0 / 15.0
+"""How far the simplified hull may leave the grid's, at most and in parts of the distance: half of it would mean nearly
+twice as many triangles to draw."""
+
+LIFT = 0.25
+"""By this part of it the hull is made larger beforehand: triangles between fewer corners cut off what is round."""
+
+HULLS_MAX = 64
+"""Hulls kept for meshes met again, as when the cell is sent anew: two arms with their tools."""
+
+_hulls: dict[tuple[str, float], TriangleMesh] = {}
+
+
+def hull_around(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
+    """The outer surface at `distance_m` from `mesh`, within some 3 mm; closed, however open the mesh was.
+
+    Takes some hundredths of a second; the same mesh has its hull at once.
+
+    Raises:
+        InputError: the distance is below `DISTANCE_MIN_M`.
+    """
+    if not distance_m >= DISTANCE_MIN_M:
+        raise InputError(f"hull of {mesh.name}: expected a distance of at least {DISTANCE_MIN_M} m, got {distance_m}")
+    hull = _hulls.pop((mesh.sha256, distance_m), None) or _make_hull(mesh, distance_m)
+    while len(_hulls) >= HULLS_MAX:
+        del _hulls[next(iter(_hulls))]
+    _hulls[mesh.sha256, distance_m] = hull
+    return hull
+
+
+def _make_hull(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
+    """What `hull_around` keeps."""
+    grid_m = GRID_SHARE * distance_m
+    low = mesh.vertices.min(axis=0) - np.float32(distance_m + 3.0 * grid_m)
+    size = mesh.vertices.max(axis=0) + np.float32(distance_m + 3.0 * grid_m) - low
+    grid_m = max(grid_m, float((np.prod(size) / GRID_NODES_MAX) ** (1.0 / 3.0)))
+    shape = np.ceil(size / grid_m).astype(int) + 1
+    simplify_m = min(SIMPLIFY_MAX_M, SIMPLIFY_SHARE * distance_m)
+    lifted_m = distance_m + LIFT * simplify_m
+    field = _distance(mesh, low, shape, grid_m, lifted_m) - np.float32(lifted_m)
+    outside = np.empty(field.shape, np.bool_)
+    kernels.flood_outside(field < 0.0, outside, np.empty(field.size, np.int64))
+    # A cavity is inside, too.
+    field[~outside & (field >= 0.0)] = -grid_m
+    vertices, faces = _surface(field)
+    return _simplified(mesh.name, (vertices * np.float32(grid_m) + low).astype(np.float32), faces, simplify_m)
+
+
+def _distance(
+    mesh: TriangleMesh, origin_m: NDArray[np.float32], shape: NDArray[np.int64], grid_m: float, distance_m: float
+) -> NDArray[np.float32]:
+    """Distance (nx, ny, nz) in metres of the grid's nodes from the mesh, as far as it matters."""
+    spacing_m = SAMPLE_SHARE * distance_m
+    number = kernels.sample_faces(mesh.vertices, mesh.faces, spacing_m, np.empty((0, 3), np.float32))
+    samples_m = np.empty((number, 3), np.float32)
+    kernels.sample_faces(mesh.vertices, mesh.faces, spacing_m, samples_m)
+    # Fine meshes give many more points than are needed; one of each grain will do.
+    grain = np.floor(samples_m / (0.5 * spacing_m)).astype(np.int64)
+    grain -= grain.min(axis=0)
+    _, first = np.unique(np.ravel_multi_index(tuple(grain.T), tuple(grain.max(axis=0) + 1)), return_index=True)
+    reach = int(np.ceil((distance_m + grid_m) / grid_m))
+    far_m = distance_m + 2.0 * grid_m
+    squared_m2 = np.full(tuple(shape), far_m * far_m, np.float32)
+    kernels.spread_distance(samples_m[first], origin_m.astype(np.float32), np.float32(grid_m), reach, squared_m2)
+    return np.sqrt(squared_m2)
+
+
+def _surface(field: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Vertices (V, 3) in nodes and faces (F, 3) of the zero surface."""
+    cells = np.empty(field.shape, np.int32)
+    numbers = kernels.surface_net(field, cells, np.empty((0, 3), np.float32), np.empty((0, 3), np.int32))
+    vertices, faces = np.empty((numbers[0], 3), np.float32), np.empty((numbers[1], 3), np.int32)
+    kernels.surface_net(field, cells, vertices, faces)
+    return vertices, faces
+
+
+def _simplified(
+    name: str, vertices_m: NDArray[np.float32], faces: NDArray[np.int32], tolerance_m: float
+) -> TriangleMesh:
+    """With as few triangles as `tolerance_m` allows."""
+    solid = manifold3d.Manifold(manifold3d.Mesh(vertices_m, faces.astype(np.uint32)))
+    if solid.status() == manifold3d.Error.NoError and solid.num_tri() > 0:
+        found = solid.simplify(tolerance_m).to_mesh()
+        vertices_m = np.ascontiguousarray(found.vert_properties[:, :3], np.float32)
+        faces = np.ascontiguousarray(found.tri_verts, np.int32)
+    else:
+        logger.debug("%s: its hull touches itself and is drawn with all %d triangles", name, len(faces))
+    return TriangleMesh(name, vertices_m, faces, closed=True)

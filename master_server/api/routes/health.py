@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the master lives, for service managers and balancers and so without a token; and how it fares."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from fastapi import APIRouter, Request, Response
+from prometheus_client import CONTENT_TYPE_LATEST
+from pydantic import BaseModel, Field
+
+from master_server.api.metrics import VERSION, Metrics
+from master_server.api.routes.common import READERS, MasterDependency
+from shared.clock import NS_PER_S, monotonic_ns
+
+router = APIRouter(tags=["health"])
+
+
+class HealthAnswer(BaseModel):
+    """`GET /healthz`: nothing that is not for everyone on the network."""
+
+    status: Literal["ok"]
+    version: str
+    uptime_s: float
+    units: int = Field(description="How many have a slot.")
+    live: int = Field(description="How many of them are live.")
+    storage: str = Field(description="`ok`, or why the last change could not be stored.")
+
+
+@router.get("/healthz")
+async def healthz(request: Request, master: MasterDependency) -> HealthAnswer:
+    """Answers while the event loop runs; whether the map is complete, `GET /voxels` tells."""
+    now_ns = monotonic_ns()
+    return HealthAnswer(
+        status="ok",
+        version=VERSION,
+        uptime_s=round((now_ns - request.app.state.started_at_ns) / NS_PER_S, 1),
+        units=len(master.registry),
+        live=sum(master.judge(slot, now_ns)[0] == "live" for slot in master.registry),
+        storage="ok" if master.store.trouble is None else "the last change could not be stored",
+    )
+
+
+@router.get(
+    "/metrics",
+    dependencies=READERS,
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
+)
+async def metrics(request: Request) -> Response:
+    """All series of the master, as Prometheus text."""
+    found = request.app.state.metrics
+    assert isinstance(found, Metrics)
+    return Response(found.exposition(), media_type=CONTENT_TYPE_LATEST)

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recording what the master sees, switched while it runs."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Request
+
+from master_server.api.routes.common import OPERATOR_ONLY, READERS, Negotiated
+from master_server.recording.recorder import Recorder, RecordingStatus
+from shared.errors import Refusal
+
+router = APIRouter(tags=["recording"], route_class=Negotiated)
+
+
+async def recorder_of(request: Request) -> Recorder:
+    """The recorder of this application.
+
+    Raises:
+        Refusal: 409, it has none.
+    """
+    recorder = request.app.state.recorder
+    if recorder is None:
+        raise Refusal(409, "recording: there is nowhere to write to")
+    assert isinstance(recorder, Recorder)
+    return recorder
+
+
+RecorderDependency = Annotated[Recorder, Depends(recorder_of)]
+
+
+@router.get("/recording", dependencies=READERS)
+async def status(recorder: RecorderDependency) -> RecordingStatus:
+    """Whether the master records, to which file, and what was left out."""
+    return recorder.status()
+
+
+@router.post("/recording", dependencies=OPERATOR_ONLY)
+async def start(recorder: RecorderDependency) -> RecordingStatus:
+    """Begin to record; refused (507) with the reason when the disk is full."""
+    return await recorder.start()
+
+
+@router.delete("/recording", dependencies=OPERATOR_ONLY)
+async def stop(recorder: RecorderDependency) -> RecordingStatus:
+    """Finish the recording; its files stay."""
+    return await recorder.stop()

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording played: where it stands, and what a replay refuses."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Request
+from starlette.responses import JSONResponse
+from starlette.types import Receive, Scope, Send
+
+from master_server.api.routes.common import IS_REPLAY, OPERATOR_ONLY, READERS, Negotiated
+from master_server.recording.replay import Replay, ReplayAnswer, ReplayRequest
+from shared.clock import monotonic_ns
+
+router = APIRouter(tags=["replay"], route_class=Negotiated)
+
+
+async def replay_of(request: Request) -> Replay:
+    """The replay of this application."""
+    replay = request.app.state.master
+    assert isinstance(replay, Replay)
+    return replay
+
+
+ReplayDependency = Annotated[Replay, Depends(replay_of)]
+
+
+@router.get("/replay", dependencies=READERS)
+async def replay(replay: ReplayDependency) -> ReplayAnswer:
+    """Where the replay stands."""
+    return replay.answer(monotonic_ns())
+
+
+@router.put("/replay", dependencies=OPERATOR_ONLY)
+async def change_replay(body: ReplayRequest, replay: ReplayDependency) -> ReplayAnswer:
+    """Go elsewhere in it, pause it, or play it at another speed."""
+    return replay.change(body, monotonic_ns())
+
+
+@router.get("/healthz")
+async def healthz() -> dict[str, Any]:
+    """Answers while the event loop runs, and tells that this is no master."""
+    return {"status": "ok", "replay": True}
+
+
+class RefusedUpdate:
+    """`POST /update` of a unit that takes a replay for a master: an ASGI application for the one path."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        await JSONResponse({"detail": IS_REPLAY}, 409)(scope, receive, send)

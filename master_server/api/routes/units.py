@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Registering, and what is known of each unit."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Path, Request
+
+from master_server.api.routes.common import (
+    OPERATOR_ONLY,
+    READERS,
+    UNIT_ONLY,
+    MasterDependency,
+    Negotiated,
+    ReadableDependency,
+    bearer,
+    ip_of,
+    is_known,
+)
+from master_server.security import Role
+from shared.clock import monotonic_ns
+from shared.messages import Command, InitializeAnswer, InitializeRequest, PoseAnswer, PoseRequest, UnitRow
+
+router = APIRouter(tags=["units"], route_class=Negotiated)
+
+UnitId = Annotated[int, Path(ge=0, lt=2**31, description="Of `GET /units`.")]
+
+
+@router.post("/initialize", dependencies=UNIT_ONLY)
+async def initialize(body: InitializeRequest, request: Request, master: MasterDependency) -> InitializeAnswer:
+    """A unit asks for its slot; the same IP keeps the same id."""
+    return master.initialize(body, ip_of(request.scope), monotonic_ns())
+
+
+@router.get("/units", dependencies=READERS)
+async def units(master: ReadableDependency) -> list[UnitRow]:
+    """One row a unit."""
+    return master.units(monotonic_ns())
+
+
+@router.delete("/units/{unit_id}", dependencies=OPERATOR_ONLY, status_code=204)
+async def forget(unit_id: UnitId, master: MasterDependency) -> None:
+    """Forget a unit that is gone; one that still runs comes back as a new one."""
+    master.forget(unit_id)
+
+
+@router.put("/units/{unit_id}/pose", dependencies=[bearer])
+async def set_pose(
+    unit_id: UnitId,
+    body: PoseRequest,
+    request: Request,
+    master: MasterDependency,
+    role: Annotated[Role, Depends(is_known)],
+) -> PoseAnswer:
+    """Where the camera is; a unit may tell only its own."""
+    ip = ip_of(request.scope) if role is Role.UNIT else None
+    return PoseAnswer(pose=master.set_pose(unit_id, body.T_world_camera, body.origin, ip, body.quality))
+
+
+@router.post("/units/{unit_id}/background", dependencies=OPERATOR_ONLY, status_code=202)
+async def learn_background(unit_id: UnitId, master: MasterDependency) -> Command:
+    """Have a unit learn the empty cell; nobody should be in it. `GET /units` tells what became of it."""
+    return master.ask(unit_id, "learn_background", monotonic_ns())
+
+
+@router.delete("/units/{unit_id}/background", dependencies=OPERATOR_ONLY, status_code=202)
+async def drop_background(unit_id: UnitId, master: MasterDependency) -> Command:
+    """Have a unit forget what it learned of the empty cell."""
+    return master.ask(unit_id, "drop_background", monotonic_ns())
+
+
+@router.post("/units/{unit_id}/calibrate", dependencies=OPERATOR_ONLY, status_code=202)
+async def calibrate(unit_id: UnitId, master: MasterDependency) -> Command:
+    """Have a unit look for the calibration board again. `GET /units` tells what became of it."""
+    return master.ask(unit_id, "calibrate", monotonic_ns())
+
+
+@router.post("/units/{unit_id}/refine", dependencies=OPERATOR_ONLY, status_code=202)
+async def refine(unit_id: UnitId, master: MasterDependency) -> Command:
+    """Have a unit refine its camera's pose by the CAD that it sees. `GET /units` tells what became of it."""
+    return master.ask(unit_id, "refine", monotonic_ns())

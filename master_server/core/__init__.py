@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The merge and all that it rests on, without a network.
+
+In the order of the flow:
+
+    robot_joints  the robot's joints, as a short history
+    coverage      what the units look through, united
+    merged_map    the units' voxels, merged (Algorithm 9)
+    units         the units' slots and how far each can be trusted (Algorithm 8)
+    master        all of that held together, without a network
+    read_model    what readers see: a master, or a recording of one
+"""
+
+from master_server.core.master import MapView, Master
+from master_server.core.merged_map import MergedMap
+from master_server.core.read_model import Readable, ReadableCell
+from master_server.core.robot_joints import RobotJoints
+from master_server.core.units import Registry
+
+__all__ = [
+    "MapView",
+    "Master",
+    "MergedMap",
+    "Readable",
+    "ReadableCell",
+    "Registry",
+    "RobotJoints",
+]

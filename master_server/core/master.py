@@ -1,0 +1,448 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The master without a network: slots, merge, coverage, robot, settings and cell held together.
+
+Every call is handed the time; nothing here waits, reads a file or knows HTTP.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from master_server.cells.published import PublishedCell
+from master_server.core.coverage import Coverage, blocks_of
+from master_server.core.merged_map import NO_KEYS, MergedMap
+from master_server.core.robot_joints import RobotJoints
+from master_server.core.units import Registry, Slot
+from master_server.persistence import Store, beginning
+from shared.cell import Cell
+from shared.configuration import sentence
+from shared.errors import Refusal
+from shared.lattice import Lattice
+from shared.messages import (
+    CONTRACT_VERSION,
+    CellAnswer,
+    Command,
+    InitializeAnswer,
+    InitializeRequest,
+    JointsRequest,
+    LatticeDescription,
+    Matrix,
+    PoseOrigin,
+    PoseQuality,
+    RobotAnswer,
+    State,
+    UnitRow,
+    UpdateAnswer,
+    UpdateRequest,
+    Verb,
+    Versions,
+    matrix_of,
+)
+from shared.settings import Settings
+from shared.transforms import validated
+from shared.wire import keys_from_bytes
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class MapView:
+    """The merged map at one time: keys (N,) uint32 ascending, witnesses (N,) uint8; and whether it is all there is.
+
+    `reports` are the keys of each live unit by its id, of which it was merged.
+    """
+
+    lattice: Lattice
+    lattice_version: int
+    keys: NDArray[np.uint32]
+    witnesses: NDArray[np.uint8]
+    reasons: tuple[str, ...]
+    oldest_view_age_s: float | None
+    units_live: int
+    reports: Mapping[int, NDArray[np.uint32]] = field(default_factory=dict)
+
+    @property
+    def complete(self) -> bool:
+        """Whether a voxel that is not reported, in a block that is seen, holds nothing unknown."""
+        return not self.reasons
+
+
+class Master:
+    """What the master knows, and what may be asked of it."""
+
+    def __init__(self, cell: Cell, settings: Settings, store: Store | None = None) -> None:
+        """Begins where the master before it ended, by its `store`; with none, nothing outlives it.
+
+        Where `cell` and `settings`, as configured, are others than were stored, `beginning` decides.
+
+        Raises:
+            InputError: the cell needs too many voxels of the size in the settings.
+            ConfigError: the store is damaged.
+            CellError: a mesh is absurdly large and does not touch the box.
+            Refusal: 507, what it begins with cannot be stored.
+        """
+        self.store = Store.in_memory() if store is None else store
+        saved = self.store.load()
+        begun = beginning(saved, cell, settings)
+        self.published = PublishedCell.of(begun.cell)
+        lattice = begun.cell.lattice(begun.settings.voxel_size_m)
+        if begun.is_news:
+            self.store.begin(begun.cell, begun.cell_file, begun.settings, begun.configured, begun.versions)
+        cell = begun.cell
+        self.settings = settings = begun.settings
+        self.versions = begun.versions
+        self.registry = Registry(self.store, saved.units, saved.last_id)
+        self.robot = RobotJoints(cell.robot.joint_names if cell.robot else None)
+        self.listeners: list[Callable[[], None]] = []
+        """Called after each change of what `view` says; time alone changes it too, see `next_change_ns`."""
+        self._begin_on(lattice, blocks_of(cell, settings.seen_block_size_m))
+
+    @property
+    def cell(self) -> Cell:
+        """The cell that is watched."""
+        return self.published.cell
+
+    # ------------------------------------------------------------------ units
+
+    def initialize(self, request: InitializeRequest, ip: str, now_ns: int) -> InitializeAnswer:
+        """A unit asks for its slot (Algorithm 8).
+
+        Raises:
+            Refusal: it speaks another contract, its camera reports from elsewhere, another camera reports from
+                its IP, there are too many units, or it cannot be stored.
+        """
+        if request.contract != CONTRACT_VERSION:
+            raise Refusal(400, f"contract: this master speaks version {CONTRACT_VERSION}, the unit {request.contract}")
+        slot, retired = self.registry.initialize(request, ip, now_ns, self.settings.stale_after_s)
+        for gone in (slot, *retired):
+            self._withdraw(gone.id)
+        self._changed()
+        return InitializeAnswer(
+            id=slot.id,
+            session=slot.session,
+            versions=self._versions_for(slot),
+            settings=self.settings,
+            lattice=self.lattice_description,
+            cell=self.published.reference,
+            T_world_camera=slot.T_world_camera,
+            board=self.published.document["board"],
+            joints=self.robot.since(0),
+            received_at_ns=now_ns,
+            answered_at_ns=now_ns,
+        )
+
+    def update(self, update: UpdateRequest, ip: str, now_ns: int) -> UpdateAnswer:
+        """A unit reports its newest frame; what it reported before is replaced.
+
+        Raises:
+            Refusal: 404 for an unknown id, 403 for another's, 409 for an old session or sequence.
+            WireError: keys or seen report are malformed; nothing was changed.
+        """
+        slot = self.registry.own(update.id, ip)
+        if update.session != slot.session:
+            raise Refusal(409, f"unit {slot.id}: this session is over, initialize again")
+        if update.sequence <= slot.sequence:
+            raise Refusal(409, f"unit {slot.id}: expected a sequence above {slot.sequence}, got {update.sequence}")
+        on_lattice = update.versions.lattice == self.versions.lattice
+        keys = keys_from_bytes(update.keys, self.lattice.cell_count) if on_lattice else NO_KEYS
+        if update.seen is not None and update.versions == self._versions_for(slot):
+            self.coverage.report(slot.id, update.seen)
+        self._take_in(slot, update, keys, now_ns)
+        if self.judge(slot, now_ns)[0] == "live":
+            self.map.replace(slot.id, keys)
+        else:
+            self.map.withdraw(slot.id)
+        self._changed()
+        return self._answer(slot, update, now_ns)
+
+    def judge(self, slot: Slot, now_ns: int) -> tuple[State, str]:
+        """A unit's state now, and why in words; a state other than the last one found is logged."""
+        state, reason = slot.judge(now_ns, self.versions, self.settings)
+        if state != slot.told_state:
+            slot.tell(state, reason)
+        return state, reason
+
+    def units(self, now_ns: int) -> list[UnitRow]:
+        """One row a unit."""
+        rows = []
+        for slot in self.registry:
+            pose = slot.T_world_camera
+            range_m = None if pose is None else self.coverage.range_m(slot.id, pose)
+            rows.append(slot.row(now_ns, *self.judge(slot, now_ns), None if range_m is None else round(range_m, 2)))
+        return rows
+
+    def unit_states(self, now_ns: int) -> list[dict[str, Any]]:
+        """Of each row what a stream tells at every change: id, ip, state, reason, age and voxels."""
+        rows = []
+        for slot in self.registry:
+            state, reason = self.judge(slot, now_ns)
+            age_s = slot.age_s(now_ns)
+            rows.append(
+                {
+                    "id": slot.id,
+                    "ip": slot.ip,
+                    "state": state,
+                    "reason": reason,
+                    "age_s": None if age_s is None else round(age_s, 4),
+                    "voxels": len(slot.keys),
+                }
+            )
+        return rows
+
+    def forget(self, unit_id: int) -> None:
+        """Delete a unit. If it still runs it comes back, as a new one.
+
+        Raises:
+            Refusal: 404, there is none; 507, it cannot be stored.
+        """
+        self.registry.remove(unit_id)
+        self._withdraw(unit_id)
+        self._changed()
+
+    def set_pose(
+        self,
+        unit_id: int,
+        T_world_camera: Matrix,
+        origin: PoseOrigin,
+        ip: str | None,
+        quality: PoseQuality | None = None,
+    ) -> int:
+        """A camera's pose is known, by whatever means; returns its version. `ip` is the caller's, if it is a unit.
+
+        Raises:
+            Refusal: 404, there is no such unit; 403, it is another's; 507, it cannot be stored.
+            InputError: the pose is no rigid transform.
+        """
+        slot = self.registry.get(unit_id) if ip is None else self.registry.own(unit_id, ip)
+        pose = matrix_of(validated(T_world_camera, "T_world_camera"))
+        self.registry.set_pose(slot, pose, origin, quality)
+        self._withdraw(slot.id)
+        self._changed()
+        logger.info("unit %d (%s): its pose is set (%s)", slot.id, slot.ip, origin, extra=slot.log_fields("pose"))
+        return slot.pose_version
+
+    def ask(self, unit_id: int, verb: Verb, now_ns: int) -> Command:
+        """Have a unit do something.
+
+        Raises:
+            Refusal: 404, there is none; 409, too much waits for it.
+        """
+        return self.registry.ask(self.registry.get(unit_id), verb, now_ns)
+
+    # ------------------------------------------------------------------ what everyone asks
+
+    def view(self, now_ns: int) -> MapView:
+        """The union of what live units report, and what it lacks (Algorithm 9)."""
+        reasons = []
+        ages_s = []
+        for slot in self.registry:
+            state, reason = self.judge(slot, now_ns)
+            if state != "live":
+                self.map.withdraw(slot.id)
+                reasons.append(f"unit {slot.id} ({slot.ip}) is {state}: {reason}")
+                continue
+            self.map.replace(slot.id, slot.keys)
+            ages_s.append(slot.age_s(now_ns) or 0.0)
+            if not self.coverage.has(slot.id):
+                reasons.append(f"unit {slot.id} ({slot.ip}) has not reported what it looks through")
+        if not len(self.registry):
+            reasons.append("there is no unit")
+        robot_state, robot_reason = self.robot.state(now_ns, self.settings.robot_stale_after_s)
+        if robot_state not in ("fresh", "none"):
+            reasons.append(robot_reason)
+        keys, witnesses = self.map.voxels()
+        return MapView(
+            self.lattice,
+            self.versions.lattice,
+            keys,
+            witnesses,
+            tuple(reasons),
+            max(ages_s, default=None),
+            len(ages_s),
+            self.map.reports(),
+        )
+
+    def seen_by(self, now_ns: int) -> NDArray[np.uint8]:
+        """How many live units look through each block, in the shape of `coverage.blocks`."""
+        return self.coverage.seen_by(slot.id for slot in self.registry if self.judge(slot, now_ns)[0] == "live")
+
+    def blocks_at(self, now_ns: int) -> Lattice:
+        """The blocks that `seen_by` counts in."""
+        return self.coverage.blocks
+
+    def next_change_ns(self, now_ns: int) -> int | None:
+        """The time after which a unit or the robot is stale if it stays silent; the first of them, None without any."""
+        moments = [slot.expires_at_ns(self.settings.stale_after_s) for slot in self.registry]
+        moments.append(self.robot.expires_at_ns(self.settings.robot_stale_after_s))
+        return min((moment for moment in moments if moment is not None and moment >= now_ns), default=None)
+
+    # ------------------------------------------------------------------ robot
+
+    def put_joints(self, request: JointsRequest, now_ns: int) -> None:
+        """The robot tells where it is; raises as `RobotJoints.put`."""
+        was_fresh = self.robot.state(now_ns, self.settings.robot_stale_after_s)[0] == "fresh"
+        self.robot.put(request, now_ns)
+        if not was_fresh:
+            self._changed()
+
+    def robot_answer(self, since_ns: int | None, now_ns: int) -> RobotAnswer:
+        """The newest joints, or all after `since_ns`."""
+        state, reason = self.robot.state(now_ns, self.settings.robot_stale_after_s)
+        age_s = self.robot.age_s(now_ns)
+        newest = self.robot.newest
+        samples = self.robot.since(since_ns) if since_ns is not None else () if newest is None else (newest,)
+        return RobotAnswer(
+            state=state,
+            reason=reason,
+            joint_names=self.robot.joint_names or (),
+            age_s=None if age_s is None else round(age_s, 4),
+            now_ns=now_ns,
+            joints=samples,
+        )
+
+    # ------------------------------------------------------------------ what an operator changes
+
+    def change_settings(self, changes: dict[str, Any]) -> Settings:
+        """Change some settings; the others stay. Every unit has them with the answer to its next update.
+
+        Raises:
+            Refusal: 422, a name is unknown or a value out of range; 507, it cannot be stored.
+            InputError: the cell would need too many voxels of that size; nothing was changed.
+        """
+        try:
+            settings = Settings.model_validate({**self.settings.model_dump(), **changes})
+        except ValidationError as error:
+            raise Refusal(422, sentence(error)) from error
+        if settings == self.settings:
+            return settings
+        lattice = self.cell.lattice(settings.voxel_size_m)
+        blocks = blocks_of(self.cell, settings.seen_block_size_m)
+        lattice_changes = lattice != self.lattice
+        versions = Versions(
+            settings=self.versions.settings + 1,
+            lattice=self.versions.lattice + lattice_changes,
+            cell=self.versions.cell,
+        )
+        self.store.save_settings(settings, versions)
+        self.settings, self.versions = settings, versions
+        if lattice_changes or blocks != self.coverage.blocks:
+            self._begin_on(lattice, blocks)
+        self._changed()
+        return settings
+
+    def change_cell(self, cell: Cell | PublishedCell) -> CellAnswer:
+        """Watch another cell from now on. Every unit learns of it with the answer to its next update, and is not live
+        until it works with it.
+
+        The robot's joints are kept if the robot is the same.
+
+        Raises:
+            InputError: the cell would need too many voxels; the old one stays.
+            CellError: a mesh is absurdly large and does not touch the box; the old one stays.
+            Refusal: 507, it cannot be stored; the old one stays.
+        """
+        published = cell if isinstance(cell, PublishedCell) else PublishedCell.of(cell)
+        lattice = published.cell.lattice(self.settings.voxel_size_m)
+        blocks = blocks_of(published.cell, self.settings.seen_block_size_m)
+        if published.reference == self.published.reference:
+            return self.cell_answer
+        versions = self.versions.model_copy(
+            update={
+                "cell": self.versions.cell + 1,
+                "lattice": self.versions.lattice + (lattice != self.lattice),
+            }
+        )
+        self.store.save_cell(published.document, published.meshes, versions)
+        if published.document["robot"] != self.published.document["robot"]:
+            robot = published.cell.robot
+            self.robot = RobotJoints(robot.joint_names if robot else None)
+        self.published, self.versions = published, versions
+        # Whatever was reported was made with the old cell.
+        self._begin_on(lattice, blocks)
+        logger.info("cell %s: version %d, %s", published.cell.name, self.versions.cell, published.reference.sha256[:8])
+        self._changed()
+        return self.cell_answer
+
+    def move_object(self, name: str, T_world_object: Matrix) -> CellAnswer:
+        """A known object stands elsewhere from now on; otherwise as `change_cell`.
+
+        Raises:
+            Refusal: 404, no object has this name; 507, it cannot be stored.
+            InputError: the pose is no rigid transform.
+        """
+        names = [body.name for body in self.cell.objects]
+        if name not in names:
+            raise Refusal(404, f"object {name}: not in this cell; its objects are {', '.join(names) or 'none'}")
+        return self.change_cell(self.published.with_object_pose(name, T_world_object))
+
+    @property
+    def cell_answer(self) -> CellAnswer:
+        """Which cell is watched now."""
+        return CellAnswer(cell=self.published.reference, versions=self.versions)
+
+    # ------------------------------------------------------------------ inside
+
+    def _changed(self) -> None:
+        for listener in self.listeners:
+            listener()
+
+    def _begin_on(self, lattice: Lattice, blocks: Lattice) -> None:
+        """Begin on another lattice and blocks; all that was reported is void."""
+        self.lattice = lattice
+        self.lattice_description = LatticeDescription.of(self.lattice)
+        self.map = MergedMap(self.lattice)
+        self.coverage = Coverage(blocks)
+        for slot in self.registry:
+            slot.keys = NO_KEYS
+
+    def _withdraw(self, unit_id: int) -> None:
+        self.map.withdraw(unit_id)
+        self.coverage.withdraw(unit_id)
+
+    def _take_in(self, slot: Slot, update: UpdateRequest, keys: NDArray[np.uint32], now_ns: int) -> None:
+        slot.sequence = update.sequence
+        slot.arrived_at_ns = now_ns
+        slot.versions = update.versions
+        slot.health = update.health
+        slot.phase = update.phase
+        slot.keys = keys
+        if update.exchange is not None:
+            slot.clock.add(update.exchange)
+        if update.captured_at_ns != slot.captured_at_ns and update.captured_at_ns is not None:
+            slot.captures_ns.append(update.captured_at_ns)
+        slot.captured_at_ns = update.captured_at_ns
+        for outcome in update.done:
+            slot.end(outcome)
+        if slot.asked:
+            slot.expire(now_ns)
+
+    def _answer(self, slot: Slot, update: UpdateRequest, now_ns: int) -> UpdateAnswer:
+        current, theirs = self._versions_for(slot), update.versions
+        answer = UpdateAnswer(
+            versions=current,
+            received_at_ns=now_ns,
+            answered_at_ns=now_ns,
+            joints=self.robot.since(update.joints_until_ns),
+            commands=slot.commands,
+        )
+        if current == theirs:
+            return answer
+        changed: dict[str, Any] = {}
+        if current.settings != theirs.settings or current.lattice != theirs.lattice:
+            changed |= {"settings": self.settings, "lattice": self.lattice_description}
+        if current.cell != theirs.cell:
+            changed["cell"] = self.published.reference
+        if current.pose != theirs.pose:
+            changed["T_world_camera"] = slot.T_world_camera
+        return answer.model_copy(update=changed)
+
+    def _versions_for(self, slot: Slot) -> Versions:
+        ours = self.versions
+        return Versions(settings=ours.settings, lattice=ours.lattice, cell=ours.cell, pose=slot.pose_version)

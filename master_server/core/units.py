@@ -1,0 +1,516 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The units' slots (Algorithm 8), and how far each unit can be trusted now."""
+
+from __future__ import annotations
+
+import logging
+import math
+import secrets
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from master_server.core.merged_map import MAX_WITNESSES, NO_KEYS
+from master_server.persistence import Store, UnitRecord
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.errors import Refusal
+from shared.messages import (
+    MAX_COMMANDS,
+    Command,
+    CommandRow,
+    Health,
+    ImageKind,
+    InitializeRequest,
+    Matrix,
+    Outcome,
+    Phase,
+    PoseOrigin,
+    PoseQuality,
+    State,
+    UnitRow,
+    Verb,
+    Versions,
+)
+from shared.settings import Settings
+from shared.timebase import ClockOffset
+from shared.transforms import angle_rad, inverse
+
+logger = logging.getLogger(__name__)
+
+MAX_UNITS = 64
+"""More cameras than any cell that we heard of has; bounds the tables, and the witnesses of a voxel."""
+
+assert MAX_UNITS <= MAX_WITNESSES
+
+REFINED_MM, REFINED_DEG = 100.0, 5.0
+"""A pose that was refined lies this near to the one that a unit was told: as far as units refine."""
+
+FPS_FRAMES = 31
+"""Frames over which the frame rate is taken: two seconds at 15 fps."""
+
+FUTURE_TOLERANCE_NS = 5 * NS_PER_MS
+"""A capture may seem this much later than now beyond what the clock's uncertainty explains."""
+
+BLIND_VALID_SHARE = 0.05
+"""A covered lens measures nothing; the emptiest honest view of a cell still measures a fifth of its pixels."""
+
+MOVED_AGREEING_SHARE = 0.1
+"""A camera that was turned agrees with its static surfaces by chance only; a crowd before it hides less."""
+
+MOVED_STATIC_SHARE = 0.1
+"""With fewer pixels before known surfaces there is nothing to tell a moved camera by."""
+
+COMMAND_EXPIRES_S = 600.0
+"""Learning the background at one frame a second takes minutes; what is not answered after ten of them never will be."""
+
+TOLD_ORIGINS = ("configured", "source")
+"""Of poses that the unit itself was told: it may tell another one later. What was measured or set here stays."""
+
+IMAGE_EXPIRES_S = 5.0
+"""The unit needs one frame and one update for it; whoever waits in front of a browser has lost patience by then."""
+
+
+@dataclass
+class _Asked:
+    """A command that the unit has not answered yet."""
+
+    command: Command
+    expires_at_ns: int
+    on_end: Callable[[Outcome], None] | None = None
+
+
+@dataclass
+class Slot:
+    """What the master knows of the one camera behind an IP. Times of the unit are by the unit's clock."""
+
+    record: UnitRecord
+    session: int = field(default_factory=lambda: secrets.randbits(32))
+    registered: bool = False
+    sequence: int = -1
+    clock: ClockOffset = field(default_factory=ClockOffset)
+    arrived_at_ns: int | None = None
+    captured_at_ns: int | None = None
+    captures_ns: deque[int] = field(default_factory=lambda: deque(maxlen=FPS_FRAMES))
+    versions: Versions = field(default_factory=Versions)
+    keys: NDArray[np.uint32] = field(default_factory=lambda: NO_KEYS)
+    health: Health = field(default_factory=Health)
+    phase: Phase = "registering"
+    told_pose: Matrix | None = None
+    warning: str = ""
+    asked: deque[_Asked] = field(default_factory=deque)
+    last_command: CommandRow | None = None
+    told_state: State | None = None
+    updates: int = 0
+    received_bytes: int = 0
+
+    id: int = field(init=False)
+    ip: str = field(init=False)
+    T_world_camera: Matrix | None = field(init=False)
+    pose_version: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.become(self.record)
+
+    def become(self, record: UnitRecord) -> None:
+        """What is kept of it is this from now on; with another pose, what it reported is void."""
+        if record.pose_version != self.record.pose_version:
+            self.keys = NO_KEYS
+        self.record = record
+        # Each update asks for these.
+        self.id, self.ip = record.id, record.ip
+        self.T_world_camera, self.pose_version = record.T_world_camera, record.pose_version
+        self.warning = _pose_warning(record, self.told_pose)
+
+    def begin_session(self, told_pose: Matrix | None) -> None:
+        """The unit registered; whatever it said before is void."""
+        # Random, so that a session of a master before this one is never mistaken for a current one.
+        self.session = secrets.randbits(32)
+        self.registered = True
+        self.sequence = -1
+        self.clock = ClockOffset()
+        self.arrived_at_ns = self.captured_at_ns = None
+        self.captures_ns.clear()
+        self.keys = NO_KEYS
+        self.health = Health()
+        self.phase = "fetching"
+        self.told_pose = told_pose
+        self.warning = _pose_warning(self.record, told_pose)
+
+    @property
+    def serial(self) -> str:
+        """Serial number of the camera."""
+        return self.record.serial
+
+    def is_silent(self, now_ns: int, after_s: float) -> bool:
+        """Whether no update came for `after_s`."""
+        arrival_age_s = self.arrival_age_s(now_ns)
+        return arrival_age_s is None or arrival_age_s > after_s
+
+    @property
+    def commands(self) -> tuple[Command, ...]:
+        """What the unit was asked and did not answer yet, the oldest first."""
+        return tuple(asked.command for asked in self.asked)
+
+    def expire(self, now_ns: int) -> None:
+        """Give up what the unit did not answer in its time."""
+        for asked in [asked for asked in self.asked if asked.expires_at_ns <= now_ns]:
+            limit_s = IMAGE_EXPIRES_S if asked.command.verb == "image" else COMMAND_EXPIRES_S
+            self.end(Outcome(asked.command.id, f"the unit did not answer within {limit_s:g} s"))
+
+    def end(self, outcome: Outcome) -> None:
+        """A command came to an end; harmless when it had before."""
+        for asked in [asked for asked in self.asked if asked.command.id == outcome.id]:
+            self.asked.remove(asked)
+            if asked.on_end is not None:
+                asked.on_end(outcome)
+            verb = asked.command.verb
+            level = logging.DEBUG if verb == "image" else logging.INFO
+            fields = {**self.log_fields("command"), "verb": verb}
+            logger.log(
+                level,
+                "unit %d (%s): command %d, %s: %s",
+                self.id,
+                self.ip,
+                outcome.id,
+                verb,
+                outcome.text,
+                extra=fields,
+            )
+            if self.last_command is not None and self.last_command.id == outcome.id:
+                self.last_command = self.last_command.model_copy(update={"outcome": outcome.text})
+
+    def age_s(self, now_ns: int) -> float | None:
+        """Seconds from the last frame's capture to the master's `now_ns`; None while it cannot be told."""
+        if self.captured_at_ns is None or not self.clock.known:
+            return None
+        return (now_ns - self.captured_at_ns - self.clock.offset_ns) / NS_PER_S
+
+    def arrival_age_s(self, now_ns: int) -> float | None:
+        """Seconds since an update arrived."""
+        return None if self.arrived_at_ns is None else (now_ns - self.arrived_at_ns) / NS_PER_S
+
+    def expires_at_ns(self, stale_after_s: float) -> int | None:
+        """When, by the master's clock, its last view becomes too old; None while it has none."""
+        if self.arrived_at_ns is None or self.captured_at_ns is None or not self.clock.known:
+            return None
+        newest_ns = min(self.arrived_at_ns, self.captured_at_ns + self.clock.offset_ns)
+        return newest_ns + round(stale_after_s * NS_PER_S)
+
+    def tell(self, state: State, reason: str) -> None:
+        """Log that its state is another one."""
+        level = logging.INFO if state == "live" else logging.WARNING
+        before = f"{self.told_state} → " if self.told_state else ""
+        why = f": {reason}" if reason else ""
+        fields = {**self.log_fields("state"), "state": state, "reason": reason}
+        logger.log(level, "unit %d (%s): %s%s%s", self.id, self.ip, before, state, why, extra=fields)
+        self.told_state = state
+
+    def log_fields(self, event: str) -> dict[str, object]:
+        """What a line of the log about it carries besides its text."""
+        return {"event": event, "unit_id": self.id, "ip": self.ip}
+
+    def clock_uncertainty_ns(self, now_ns: int) -> int | None:
+        """How far `age_s` may be off."""
+        return self.clock.uncertainty_ns(now_ns - self.clock.offset_ns) if self.clock.known else None
+
+    @property
+    def fps(self) -> float:
+        """Frames a second, over the last few."""
+        captures = self.captures_ns
+        if len(captures) < 2 or captures[-1] <= captures[0]:
+            return 0.0
+        return (len(captures) - 1) * NS_PER_S / (captures[-1] - captures[0])
+
+    def judge(self, now_ns: int, current: Versions, settings: Settings) -> tuple[State, str]:
+        """The unit's state, and the reason in words when it is not live, or a warning when it is.
+
+        `current` has the versions of the master; its pose counts for nothing, each slot has its own.
+        """
+        if self.T_world_camera is None:
+            return "uncalibrated", self.record.note or self.health.trouble or "its pose is not known yet"
+        if stale := self._stale(now_ns, current, settings):
+            trouble = f" ({self.health.trouble})" if self.health.trouble else ""
+            return "stale", stale + trouble
+        health = self.health
+        if health.trouble:
+            return "blind", health.trouble
+        if health.blind:
+            return "blind", health.blind
+        if health.valid_share < BLIND_VALID_SHARE:
+            return "blind", f"only {health.valid_share:.0%} of its pixels measure anything"
+        if health.moved:
+            return "moved", health.moved
+        if health.static_share >= MOVED_STATIC_SHARE and health.agreeing_share < MOVED_AGREEING_SHARE:
+            return "moved", f"only {health.agreeing_share:.0%} of the known surfaces are where they should be"
+        if self.warning:
+            return "live", f"{self.warning}; {health.warning}" if health.warning else self.warning
+        return "live", health.warning or ""
+
+    def row(self, now_ns: int, state: State, reason: str, range_m: float | None) -> UnitRow:
+        """What `GET /units` tells."""
+        self.expire(now_ns)
+        age_s, arrival_age_s = self.age_s(now_ns), self.arrival_age_s(now_ns)
+        uncertainty_ns = self.clock_uncertainty_ns(now_ns)
+        return UnitRow(
+            id=self.id,
+            ip=self.ip,
+            serial=self.serial,
+            model=self.record.model,
+            software=self.record.software,
+            state=state,
+            reason=reason,
+            phase=self.phase,
+            age_s=None if age_s is None else round(age_s, 4),
+            arrival_age_s=None if arrival_age_s is None else round(arrival_age_s, 4),
+            clock_uncertainty_ms=None if uncertainty_ns is None else round(uncertainty_ns / NS_PER_MS, 3),
+            fps=round(self.fps, 2),
+            voxels=len(self.keys),
+            process_ms=self.health.process_ms,
+            frame_number=self.health.frame,
+            health=self.health,
+            T_world_camera=self.T_world_camera,
+            pose_origin=self.record.pose_origin,
+            pose_quality=self.record.pose_quality,
+            intrinsics=self.record.intrinsics,
+            range_m=range_m,
+            versions=self.versions,
+            last_command=self.last_command,
+        )
+
+    def _stale(self, now_ns: int, current: Versions, settings: Settings) -> str:
+        """Why its last view says nothing about now; empty when it does."""
+        limit_s = settings.stale_after_s
+        arrival_age_s, age_s = self.arrival_age_s(now_ns), self.age_s(now_ns)
+        uncertainty_ns = self.clock_uncertainty_ns(now_ns)
+        if arrival_age_s is None:
+            return "no update since it registered" if self.registered else "no update since the master started"
+        if arrival_age_s > limit_s:
+            return f"its last update came {arrival_age_s:.1f} s ago, at most {limit_s:g} s are trusted"
+        if self.captured_at_ns is None:
+            return "no frame yet"
+        if age_s is None or uncertainty_ns is None:
+            return "its clock is not known yet"
+        if uncertainty_ns > limit_s * NS_PER_S:
+            return f"its clock is known to {uncertainty_ns / NS_PER_S:.1f} s only"
+        if age_s > limit_s:
+            return f"its last frame is {age_s:.1f} s old, at most {limit_s:g} s are trusted"
+        if age_s * NS_PER_S < -(uncertainty_ns + FUTURE_TOLERANCE_NS):
+            return f"its last frame seems to be of {-age_s:.3f} s from now: its clock jumped"
+        if self.versions.lattice != current.lattice:
+            return "it does not work on the current lattice yet"
+        if self.versions.cell != current.cell:
+            return "it does not work with the current cell yet"
+        if self.versions.pose != self.pose_version:
+            return "it does not work with its current pose yet"
+        return ""
+
+
+class Registry:
+    """All slots: one for each IP, allocated once. What changes of them is stored before it counts."""
+
+    def __init__(self, store: Store, units: Iterable[UnitRecord] = (), last_id: int = 0) -> None:
+        """With the `units` of before, and the last id that was ever given."""
+        self._store = store
+        self._slots = {unit.id: Slot(unit) for unit in units}
+        self._by_ip = {slot.ip: slot for slot in self._slots.values()}
+        self._last_id = last_id
+        self._last_command = 0
+
+    def __iter__(self) -> Iterator[Slot]:
+        return iter(self._slots.values())
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    def initialize(
+        self, request: InitializeRequest, ip: str, now_ns: int, stale_after_s: float
+    ) -> tuple[Slot, list[Slot]]:
+        """The slot of this IP with a new session, and the slots that were retired for it.
+
+        A camera that turns up behind another IP retires its old slot, once that is silent for `stale_after_s`:
+        two cameras of one serial would otherwise evict each other for ever, as would two cameras behind one IP. Its
+        pose moves along only within one boot of the unit, for then merely the address changed. Another camera in a
+        slot voids the pose. A pose that the unit was told replaces none but one that a unit was told before.
+        Where a camera takes the slot of another, that one is expected in its old slot instead of being forgotten:
+        units that exchanged addresses come one after the other, and one that does not come back must be missed.
+
+        Raises:
+            Refusal: 409, the camera reports from another IP right now, or another camera from this one; 503, there
+                are MAX_UNITS already; 507, it cannot be stored.
+        """
+        elsewhere = [slot for slot in self if slot.serial == request.serial and slot.ip != ip]
+        for old in elsewhere:
+            if not old.is_silent(now_ns, stale_after_s):
+                raise Refusal(409, f"camera {request.serial} reports from IP {old.ip} (unit {old.id}) at this moment")
+        slot = self._by_ip.get(ip)
+        if slot is not None and slot.serial != request.serial and not slot.is_silent(now_ns, stale_after_s):
+            raise Refusal(
+                409,
+                f"camera {request.serial}: camera {slot.serial} reports from IP {ip} (unit {slot.id}) at this moment; "
+                "each unit needs an IP of its own",
+            )
+        if slot is None and len(self) - len(elsewhere) >= MAX_UNITS:
+            raise Refusal(503, f"no free slot: expected at most {MAX_UNITS} units; delete one that is gone")
+        record = _registered(request, ip, self._last_id + 1 if slot is None else slot.record, elsewhere)
+        moved = elsewhere[:1] if slot is not None and slot.serial != request.serial else []
+        retired = elsewhere[len(moved) :]
+        left = [_expecting(old.record, slot.record, ip) for old in moved if slot is not None]
+        if slot is None or elsewhere or record != slot.record:
+            try:
+                self._store.save_units([record, *left], [old.id for old in retired])
+            except Refusal:
+                if slot is None or elsewhere or record.pose_version != slot.pose_version:
+                    raise
+                # Only its software or its boot is another, for which no view of the cell is given up.
+                record = slot.record
+        for old in elsewhere:
+            logger.warning(
+                "unit %d (%s): camera %s is at %s now", old.id, old.ip, old.serial, ip, extra=old.log_fields("camera")
+            )
+        for old in retired:
+            self._drop(old)
+        for old, expecting in zip(moved, left, strict=True):
+            old.become(expecting)
+            old.begin_session(None)
+        if slot is None:
+            self._last_id = record.id
+            slot = self._slots[record.id] = self._by_ip[ip] = Slot(record)
+        elif slot.serial != record.serial:
+            logger.warning("unit %d (%s): %s", slot.id, ip, record.note, extra=slot.log_fields("camera"))
+        slot.become(record)
+        slot.begin_session(request.T_world_camera)
+        if slot.warning:
+            logger.warning("unit %d (%s): %s", slot.id, ip, slot.warning, extra=slot.log_fields("pose"))
+        return slot, elsewhere
+
+    def set_pose(
+        self, slot: Slot, T_world_camera: Matrix, origin: PoseOrigin, quality: PoseQuality | None = None
+    ) -> None:
+        """The camera is elsewhere from now on.
+
+        Raises:
+            Refusal: 507, it cannot be stored; nothing was changed.
+        """
+        record = slot.record.posed(T_world_camera, origin, quality=quality)
+        self._store.save_units([record])
+        slot.become(record)
+
+    def get(self, unit_id: int) -> Slot:
+        """The slot with this id.
+
+        Raises:
+            Refusal: 404, there is none.
+        """
+        slot = self._slots.get(unit_id)
+        if slot is None:
+            raise Refusal(404, f"unit {unit_id}: not known here, initialize first")
+        return slot
+
+    def own(self, unit_id: int, ip: str) -> Slot:
+        """The slot with this id, which must be the caller's.
+
+        Raises:
+            Refusal: 404, there is none; 403, it is that of another IP.
+        """
+        slot = self.get(unit_id)
+        if slot.ip != ip:
+            raise Refusal(403, f"unit {unit_id}: it is not the unit of {ip}")
+        return slot
+
+    def remove(self, unit_id: int) -> None:
+        """Forget a unit.
+
+        Raises:
+            Refusal: 404, there is none; 507, it cannot be stored.
+        """
+        slot = self.get(unit_id)
+        self._store.save_units([], [unit_id])
+        self._drop(slot)
+
+    def ask(
+        self,
+        slot: Slot,
+        verb: Verb,
+        now_ns: int,
+        image: ImageKind | None = None,
+        raw: bool = False,
+        on_end: Callable[[Outcome], None] | None = None,
+    ) -> Command:
+        """Have a unit do something; it learns of it with the answer to its next update. `on_end` is told the outcome.
+
+        Raises:
+            Refusal: 409, too many commands wait for it already.
+        """
+        slot.expire(now_ns)
+        if len(slot.asked) >= MAX_COMMANDS:
+            raise Refusal(409, f"unit {slot.id}: {MAX_COMMANDS} commands wait for it already")
+        self._last_command += 1
+        command = Command(id=self._last_command, verb=verb, image=image, raw=raw)
+        expires_s = IMAGE_EXPIRES_S if verb == "image" else COMMAND_EXPIRES_S
+        slot.asked.append(_Asked(command, now_ns + round(expires_s * NS_PER_S), on_end))
+        if verb != "image":
+            slot.last_command = CommandRow(id=command.id, verb=verb, outcome=None)
+        return command
+
+    def _drop(self, slot: Slot) -> None:
+        del self._slots[slot.id], self._by_ip[slot.ip]
+
+
+def _registered(request: InitializeRequest, ip: str, before: UnitRecord | int, elsewhere: Iterable[Slot]) -> UnitRecord:
+    """What is kept of a unit that registers: `before` is its record, or the id of one that is new."""
+    if isinstance(before, int):
+        record = UnitRecord(id=before, ip=ip)
+        for old in elsewhere:
+            if old.T_world_camera is not None and old.record.boot_id and old.record.boot_id == request.boot_id:
+                record = record.posed(old.T_world_camera, old.record.pose_origin, quality=old.record.pose_quality)
+    elif before.serial != request.serial:
+        note = f"the camera changed from {before.serial} to {request.serial}, so its pose is void"
+        record = before.posed(None, None, note)
+    else:
+        record = before
+    told = request.T_world_camera
+    if told is not None and (
+        record.T_world_camera is None or (record.pose_origin in TOLD_ORIGINS and record.T_world_camera != told)
+    ):
+        record = record.posed(told, request.pose_origin)
+    return record.model_copy(
+        update={
+            "serial": request.serial,
+            "model": request.model,
+            "software": request.software,
+            "boot_id": request.boot_id,
+            "intrinsics": request.intrinsics,
+        }
+    )
+
+
+def _expecting(left: UnitRecord, taken: UnitRecord, ip: str) -> UnitRecord:
+    """The slot that a camera left for `ip`: the one that was there is expected here, without a pose."""
+    note = f"camera {left.serial} is at {ip} now, where camera {taken.serial} was, which did not come back yet"
+    return left.posed(None, None, note).model_copy(
+        update={
+            "serial": taken.serial,
+            "model": taken.model,
+            "software": "",
+            "boot_id": "",
+            "intrinsics": taken.intrinsics,
+        }
+    )
+
+
+def _pose_warning(record: UnitRecord, told: Matrix | None) -> str:
+    """That a unit was told another pose than counts; empty when not."""
+    if told is None or record.T_world_camera is None or told == record.T_world_camera:
+        return ""
+    known_pose, told_pose = np.array(record.T_world_camera), np.array(told)
+    shift_mm = 1e3 * float(np.linalg.norm(known_pose[:3, 3] - told_pose[:3, 3]))
+    turn_deg = math.degrees(angle_rad(inverse(known_pose) @ told_pose))
+    if record.pose_origin == "refined" and shift_mm <= REFINED_MM and turn_deg <= REFINED_DEG:
+        return ""
+    return (
+        f"the unit's configuration has its camera {shift_mm:.0f} mm and {turn_deg:.1f}° from where it is by the pose "
+        f"that counts ({record.pose_origin})"
+    )

@@ -1,0 +1,337 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording opened for reading: any moment of it, in the memory of one chunk.
+
+The file is read once from its beginning to find its chunks, so that one whose writer was killed is as good as another
+up to its end.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import mmap
+import struct
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import lru_cache
+from io import BytesIO
+from pathlib import Path
+from typing import IO, Any, NamedTuple, TypeVar, cast
+
+import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, MessageIndex, Metadata
+from mcap.stream_reader import StreamReader, breakup_chunk
+from numpy.typing import NDArray
+from pydantic import BaseModel, ValidationError
+
+from master_server.core import MapView
+from master_server.recording.moment import (
+    FORMAT,
+    MAP_TOPIC,
+    METADATA,
+    SEEN_TOPIC,
+    SETTINGS_TOPIC,
+    STATE_TOPIC,
+    MapRecord,
+    SeenRecord,
+    StateRecord,
+    cell_attachment,
+    mesh_attachment,
+)
+from shared.configuration import sentence
+from shared.errors import InputError, SourceError
+from shared.lattice import Lattice
+from shared.settings import Settings
+
+logger = logging.getLogger(__name__)
+
+MAX_RECORD_BYTES = 2**30
+"""Chunks have a few MiB, meshes some hundred at most; a longer record is damage."""
+
+CHUNKS_KEPT = 4
+"""Unpacked at a time: who plays needs one, who moves to and fro a few."""
+
+PROGRESS_STEP_BYTES = 2**24
+"""Between two calls of `progress`."""
+
+UNREADABLE = (McapError, struct.error, ValueError, OverflowError, zstandard.ZstdError)
+"""All ways in which the library says that bytes are damaged."""
+
+Progress = Callable[[int, int], None]
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class Frame(NamedTuple):
+    """One recorded moment; `log_ns` since 1970."""
+
+    log_ns: int
+    state: StateRecord
+    view: MapView
+    blocks: Lattice
+    seen_by: NDArray[np.uint8]
+    settings: Settings
+
+
+class _Place(NamedTuple):
+    """Where a record lies, and when its messages begin."""
+
+    offset: int
+    length: int
+    begin_ns: int = 0
+
+
+class _RawFrame(NamedTuple):
+    log_ns: int
+    state: bytes
+    map: bytes
+    seen: bytes
+    settings: bytes
+
+
+@dataclass
+class _Index:
+    chunks: list[_Place] = field(default_factory=list)
+    attachments: dict[str, _Place] = field(default_factory=dict)
+    counts: Counter[int] = field(default_factory=Counter)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    format: str | None = None
+    end_ns: int = 0
+    trouble: str = "its writer was stopped before it could finish it"
+
+
+class Recording:
+    """A recording; a context, which closes it.
+
+    Attributes:
+        begin_ns, end_ns: of the first and the last moment, since 1970.
+        trouble: why there may be less than was recorded, empty when nothing is missing.
+        counts: messages by topic.
+    """
+
+    def __init__(self, path: Path, progress: Progress | None = None) -> None:
+        """Find what is in a file. `progress` is called with the bytes read and those in all.
+
+        Raises:
+            SourceError: there is no such file, or it holds no moment of a master.
+        """
+        self.path = path
+        self._data = _map(path)
+        try:
+            self._index = _index(path, self._data, progress)
+            self._unpacked = lru_cache(CHUNKS_KEPT)(self._unpack)
+            self._parsed = lru_cache(CHUNKS_KEPT)(self._parse)
+            self._begin()
+        except BaseException:
+            self._data.close()
+            raise
+        channels = self._index.channels
+        self.counts = {channels[key].topic: n for key, n in self._index.counts.items() if key in channels}
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._data.close()
+
+    @property
+    def trouble(self) -> str:
+        """Why there may be less than was recorded."""
+        return self._index.trouble
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the file."""
+        return len(self._data)
+
+    @property
+    def cells(self) -> list[dict[str, Any]]:
+        """The documents of all cells that were watched."""
+        return [self.cell(sha256) for sha256 in self._attached(cell_attachment(""))]
+
+    @property
+    def meshes(self) -> list[str]:
+        """The sha256 of all meshes."""
+        return self._attached(mesh_attachment(""))
+
+    @property
+    def cell_names(self) -> list[str]:
+        """The sha256 of all cells."""
+        return self._attached(cell_attachment(""))
+
+    def at(self, log_ns: int) -> Frame:
+        """The last moment that is not after `log_ns`; the first one, if that is earlier."""
+        number = max(bisect_right(self._index.chunks, log_ns, key=_begin_of) - 1, 0)
+        # A chunk whose state messages come later than its first message, or a damaged one: what was before holds.
+        for place in reversed(self._index.chunks[: number + 1]):
+            frames = self._unpacked(place)
+            index = bisect_right(frames, log_ns, key=_log_of)
+            if index:
+                return self._parsed(frames[index - 1])
+        return self._parsed(self._first)
+
+    def after(self, log_ns: int) -> int | None:
+        """The time of the first moment after `log_ns`."""
+        number = max(bisect_right(self._index.chunks, log_ns, key=_begin_of) - 1, 0)
+        for place in self._index.chunks[number:]:
+            frames = self._unpacked(place)
+            index = bisect_right(frames, log_ns, key=_log_of)
+            if index < len(frames):
+                return frames[index].log_ns
+        return None
+
+    def cell(self, sha256: str) -> dict[str, Any]:
+        """The document of a cell.
+
+        Raises:
+            SourceError: it is missing or damaged.
+        """
+        data = self._attachment(cell_attachment(sha256))
+        if data is None:
+            raise SourceError(f"{self.path}: the cell {sha256} is missing")
+        document: dict[str, Any] = json.loads(data)
+        return document
+
+    def mesh(self, sha256: str) -> bytes | None:
+        """A mesh in its canonical bytes, if it is there."""
+        return self._attachment(mesh_attachment(sha256))
+
+    def forget(self) -> None:
+        """Let go of what was unpacked; it is unpacked again when it is asked for."""
+        self._unpacked.cache_clear()
+        self._parsed.cache_clear()
+
+    def _attached(self, prefix: str) -> list[str]:
+        names = self._index.attachments
+        return [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
+
+    def _begin(self) -> None:
+        index = self._index
+        if index.format != str(FORMAT):
+            raise SourceError(f"{self.path}: expected a master's recording of format {FORMAT}, got {index.format}")
+        first = next(filter(None, map(self._unpacked, index.chunks)), None)
+        last = next(filter(None, map(self._unpacked, reversed(index.chunks))), None)
+        if first is None or last is None:
+            raise SourceError(f"{self.path}: there is no whole chunk in it: {self.trouble}")
+        self._first = first[0]
+        # What this version cannot read is told now, not to whom asks first.
+        self._parsed(self._first)
+        self.begin_ns, self.end_ns = first[0].log_ns, last[-1].log_ns
+
+    def _attachment(self, name: str) -> bytes | None:
+        place = self._index.attachments.get(name)
+        return None if place is None else Attachment.read(self._stream(place)).data
+
+    def _stream(self, place: _Place) -> ReadDataStream:
+        """A record's content, behind its opcode and length."""
+        return ReadDataStream(BytesIO(self._data[place.offset + 9 : place.offset + place.length]))
+
+    def _unpack(self, place: _Place) -> tuple[_RawFrame, ...]:
+        """The moments of a chunk; none, if it is damaged."""
+        try:
+            records = breakup_chunk(Chunk.read(self._stream(place)), validate_crc=True)
+        except UNREADABLE as error:
+            logger.warning("%s: a chunk at byte %d is damaged, passed over: %s", self.path, place.offset, error)
+            return ()
+        return tuple(_frames(records, self._index.channels))
+
+    def _parse(self, raw: _RawFrame) -> Frame:
+        try:
+            state, merged = _checked(StateRecord, raw.state), _checked(MapRecord, raw.map)
+            seen = _checked(SeenRecord, raw.seen)
+            keys, witnesses = merged.arrays()
+            view = MapView(
+                merged.lattice.lattice(),
+                merged.lattice_version,
+                keys,
+                witnesses,
+                state.reasons,
+                state.oldest_view_age_s,
+                state.units_live,
+                merged.reported(),
+            )
+            settings = _checked(Settings, raw.settings)
+            return Frame(raw.log_ns, state, view, seen.blocks.lattice(), seen.counts(), settings)
+        except InputError as error:
+            raise SourceError(f"{self.path}: {error}") from error
+
+
+def _map(path: Path) -> mmap.mmap:
+    try:
+        with path.open("rb") as file:
+            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise SourceError(f"{path}: it is empty") from error
+
+
+def _index(path: Path, data: mmap.mmap, progress: Progress | None) -> _Index:
+    """Where everything lies, as far as the file can be read."""
+    index = _Index()
+    began, told = 0, 0
+    try:
+        for record in StreamReader(cast(IO[bytes], data), emit_chunks=True, record_size_limit=MAX_RECORD_BYTES).records:
+            ended = data.tell()
+            began = max(began, 8)
+            _note(index, record, _Place(began, ended - began))
+            began = ended
+            if progress is not None and ended - told >= PROGRESS_STEP_BYTES:
+                progress(ended, len(data))
+                told = ended
+            if isinstance(record, Footer):
+                index.trouble = ""
+    except UNREADABLE as error:
+        if not began:
+            raise SourceError(f"{path}: it is no MCAP file") from error
+        if data.tell() < len(data):
+            index.trouble = f"it is damaged at byte {began}: {type(error).__name__}: {error}"
+    if progress is not None:
+        progress(len(data), len(data))
+    return index
+
+
+def _note(index: _Index, record: McapRecord, place: _Place) -> None:
+    if isinstance(record, Chunk):
+        index.chunks.append(place._replace(begin_ns=record.message_start_time))
+        if not index.channels:
+            # Channels are made with the file, so they stand in its first chunk.
+            channels = breakup_chunk(record, validate_crc=True)
+            index.channels = {channel.id: channel for channel in channels if isinstance(channel, Channel)}
+    elif isinstance(record, MessageIndex):
+        index.counts[record.channel_id] += len(record.records)
+    elif isinstance(record, Attachment):
+        index.attachments[record.name] = place
+    elif isinstance(record, Metadata) and record.name == METADATA:
+        index.format = record.metadata.get("format")
+
+
+def _frames(records: list[McapRecord], channels: dict[int, Channel]) -> Iterator[_RawFrame]:
+    """A state is the last message of its moment; what else belongs to it stands before it."""
+    latest: dict[str, bytes] = {}
+    for record in records:
+        if not isinstance(record, Message) or record.channel_id not in channels:
+            continue
+        topic = channels[record.channel_id].topic
+        latest[topic] = record.data
+        if topic == STATE_TOPIC and {MAP_TOPIC, SEEN_TOPIC, SETTINGS_TOPIC} <= latest.keys():
+            yield _RawFrame(record.log_time, record.data, latest[MAP_TOPIC], latest[SEEN_TOPIC], latest[SETTINGS_TOPIC])
+
+
+def _checked(model: type[Model], data: bytes) -> Model:
+    try:
+        return model.model_validate_json(data)
+    except ValidationError as error:
+        raise InputError(f"{model.__name__}: {sentence(error)}") from error
+
+
+def _begin_of(place: _Place) -> int:
+    return place.begin_ns
+
+
+def _log_of(frame: _RawFrame) -> int:
+    return frame.log_ns

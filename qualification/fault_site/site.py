@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A master, two units and a robot's controller as real processes, and all that may be done to them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import httpx
+import yaml
+
+from qualification.fault_site.scene import (
+    CAMERAS_M,
+    FPS,
+    NEWCOMER,
+    RESIDENTS,
+    T_WORLD_CAMERA,
+    show,
+    write_camera,
+    write_cell,
+)
+from qualification.fault_site.watch import SETTLED_S, Asker, Listener, Observer, Present, good
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.errors import CellwatchError, MasterUnreachable
+from simulation.fleet.processes import Child, Processes
+from simulation.fleet.running_master import start_master
+
+ADDRESSES = ("127.0.0.2", "127.0.0.3")
+
+SERIALS = ("ONE", "TWO")
+
+START_S = 240.0
+"""For processes to be there on a busy machine, kernels to be compiled included."""
+
+RETURN_S = 15.0
+"""For a map to be good again; what takes longer has missed its mark anyway."""
+
+LOOK_S = 0.005
+"""Between looks at a log, or at what the map said."""
+
+SETTING = {"margin_base_m": 0.031}
+"""Acknowledged before each fault; nobody may forget it."""
+
+Found = TypeVar("Found")
+
+
+class FaultError(CellwatchError):
+    """What was to be measured could not be."""
+
+
+@dataclass(eq=False)
+class Site:
+    """All that one fault is tried on. `folder` holds configurations, tokens, state, pictures and logs."""
+
+    folder: Path
+    processes: Processes
+    host: str = "127.0.0.1"
+    port: int = 0
+    present: list[Present] = field(init=False, default_factory=list)
+    units: list[Child] = field(init=False, default_factory=list)
+    master: Child = field(init=False)
+    robot: Child = field(init=False)
+    operator: httpx.AsyncClient = field(init=False)
+    asker: Asker = field(init=False)
+    listener: Listener = field(init=False)
+    watching: list[Observer] = field(init=False, default_factory=list)
+    cameras: list[Path] = field(init=False)
+    _starts: int = field(init=False, default=0)
+    _before: Any = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        self.cell = write_cell(self.folder)
+        self.cameras = [write_camera(self.folder / f"camera{i + 1}", i) for i in range(len(CAMERAS_M))]
+        self.state_dirs = [self.folder / f"unit{i + 1}" for i in range(len(CAMERAS_M))]
+        self.addresses = list(ADDRESSES)
+        self.tokens = [self.folder / f"unit{i + 1}.token" for i in range(len(CAMERAS_M))]
+        self.master_state = self.folder / "master"
+
+    # ------------------------------------------------------------------ starting
+
+    async def start_master(self, variables: Mapping[str, str] | None = None) -> None:
+        """Start it, at the same port as before, and wait until it can be asked.
+
+        Raises:
+            FaultError: it ends instead.
+        """
+        try:
+            running = await start_master(
+                self.processes, self.cell, self.master_state, "--public-reads",
+                name=self._name("master"), host=self.host, port=self.port, variables=variables, ready_s=START_S,
+            )  # fmt: skip
+        except MasterUnreachable as error:
+            raise FaultError(str(error)) from error
+        self.master, self.port = running.child, running.port
+        self.unit_token, self.operator_token = running.unit_token_file, running.operator_token_file
+        self.operator = httpx.AsyncClient(
+            base_url=f"http://127.0.0.1:{self.port}", headers=running.as_operator, trust_env=False
+        )
+
+    async def start_robot(self) -> None:
+        """Start its controller."""
+        self.robot = await self.processes.start(
+            self._name("robot"), "simulation.fleet.controller",
+            *("--url", f"http://127.0.0.1:{self.port}", "--token-file", str(self.operator_token), "--rate", "20"),
+        )  # fmt: skip
+
+    async def start_unit(
+        self,
+        index: int,
+        url: str | None = None,
+        address: str | None = None,
+        under: Sequence[str] = (),
+        variables: Mapping[str, str] | None = None,
+    ) -> Child:
+        """Start a unit; without a pose, for the master keeps it."""
+        if not self.tokens[index].exists():
+            self.tokens[index].write_text(self.unit_token.read_text())
+        document = {
+            "source": {"kind": "recorded", "folder": str(self.cameras[index]), "serial": SERIALS[index], "fps": FPS},
+            "master_url": url or f"http://127.0.0.1:{self.port}",
+            "token_file": str(self.tokens[index]),
+            "state_dir": str(self.state_dirs[index]),
+            "source_address": address or self.addresses[index],
+        }
+        config = self.folder / f"{SERIALS[index]}.yaml"
+        config.write_text(yaml.safe_dump(document))
+        name = self._name(f"unit{index + 1}")
+        child = await self.processes.start(
+            name, "qualification.fault_site.unit", str(config), under=under, variables=variables
+        )
+        self.units[index : index + 1] = [child]
+        return child
+
+    async def calm(self) -> None:
+        """Give all cameras their poses, wait until the map is complete and right, and begin to watch it.
+
+        Raises:
+            FaultError: it does not become so.
+        """
+        await until(lambda: all(registered(unit) for unit in self.units), "two registered units")
+        await self.give_poses()
+        response = await self.operator.put("/settings", json=SETTING)
+        response.raise_for_status()
+        since_ns = monotonic_ns()
+        self.present = [Present(thing, since_ns) for thing in RESIDENTS]
+        things = (*RESIDENTS, NEWCOMER)
+        self.asker, self.listener = Asker(self.port, things), Listener(self.port, things)
+        self.watching = [self.asker, self.listener]
+        for observer in self.watching:
+            observer.start()
+        await self.settled(START_S)
+        for observer in self.watching:
+            observer.answers.clear()
+        self._before = await self.acknowledged()
+        await asyncio.sleep(SETTLED_S)
+
+    async def look_away(self) -> None:
+        """Have nobody watch any more; harmless when nobody does."""
+        for observer in self.watching:
+            await asyncio.to_thread(observer.stop)
+        self.watching = []
+
+    async def give_poses(self) -> None:
+        """Tell the master where each camera stands, as an operator would."""
+        for row in (await self.operator.get("/units")).json():
+            pose = T_WORLD_CAMERA[SERIALS.index(row["serial"])]
+            answer = await self.operator.put(f"/units/{row['id']}/pose", json={"T_world_camera": pose})
+            answer.raise_for_status()
+
+    # ------------------------------------------------------------------ what is done to them
+
+    def newcomer(self) -> None:
+        """Something comes to where only the first unit looks."""
+        show(self.cameras[0], RESIDENTS[0], NEWCOMER)
+        self.present.append(Present(NEWCOMER, monotonic_ns()))
+
+    async def kill(self, child: Child) -> None:
+        """Kill it, and see it end."""
+        child.may_end = True
+        child.process.kill()
+        await child.process.wait()
+
+    # ------------------------------------------------------------------ what is found
+
+    async def settled(self, timeout_s: float = RETURN_S) -> None:
+        """Wait until the map is complete and tells of all that is there, for SETTLED_S on end.
+
+        Raises:
+            FaultError: it does not become so.
+        """
+        names = {present.thing.name for present in self.present}
+        began_ns = monotonic_ns()
+
+        def look() -> bool:
+            answers = self.asker.answers
+            end_ns = monotonic_ns()
+            if end_ns - began_ns < SETTLED_S * NS_PER_S:
+                return False
+            recent = [a for a in answers[-200:] if a.got_ns > end_ns - SETTLED_S * NS_PER_S]
+            return bool(recent) and all(good(answer, names, len(SERIALS)) for answer in recent)
+
+        await until(
+            look, "a complete map that tells of all that is there", timeout_s, lambda: f"{self.asker.answers[-1:]}"
+        )
+
+    async def acknowledged(self) -> dict[str, Any]:
+        """What the master has been told and must not forget: ids and poses by serial, and settings."""
+        rows = (await self.operator.get("/units")).json()
+        state = {row["serial"]: (row["ip"], row["id"], row["T_world_camera"]) for row in rows}
+        return {**state, "settings": (await self.operator.get("/settings")).json()}
+
+    async def lost(self) -> list[str]:
+        """What was acknowledged before the fault and is not so any more."""
+        now = await self.acknowledged()
+        return [name for name, value in self._before.items() if now.get(name) != value]
+
+    def expect(self, name: str, value: Any) -> None:
+        """From now on this is what was acknowledged last."""
+        self._before[name] = value
+
+    def _name(self, role: str) -> str:
+        self._starts += 1
+        return f"{self._starts:02}-{role}"
+
+
+def registered(unit: Child) -> bool:
+    """Whether a unit has said so.
+
+    Raises:
+        FaultError: it ended instead.
+    """
+    if unit.failed:
+        raise FaultError(f"{unit.name}: {unit.ended}; {unit.log_tail()}")
+    return b"registered at" in unit.log.read_bytes()
+
+
+async def until(
+    look: Callable[[], Found], what: str, timeout_s: float = START_S, last: Callable[[], str] = lambda: ""
+) -> Found:
+    """What `look` finds, as soon as it finds anything; `last` tells what came instead.
+
+    Raises:
+        FaultError: it does not within `timeout_s`.
+    """
+    deadline_ns = monotonic_ns() + round(timeout_s * NS_PER_S)
+    while True:
+        found = look()
+        if found:
+            return found
+        if monotonic_ns() > deadline_ns:
+            raise FaultError(f"{what}: not within {timeout_s:g} s; {last()}")
+        await asyncio.sleep(LOOK_S)

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`python -m qualification.fault_site.unit CONFIG.YAML`: the edge unit before a camera whose picture may be exchanged.
+
+All but the source is the daemon as it is installed. A recording is read ahead of its time; this picture is read at the
+moment of its capture, so that a unit that stood still never shows what was there before.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import AsyncGenerator
+
+import numpy as np
+
+import edge_unit.source_factory
+from edge_unit.__main__ import main
+from edge_unit.config import SourceConfig
+from edge_unit.sources import DepthFrame, DepthSource
+from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
+from qualification.fault_site.scene import FPS, IMAGE
+from shared.clock import NS_PER_S, monotonic_ns
+
+
+class PictureSource(RecordedSource):
+    """A camera that sees whatever lies in its folder now."""
+
+    def __init__(self, config: RecordedSourceConfig) -> None:
+        super().__init__(config)
+        self._image = config.folder / IMAGE
+
+    async def frames(self) -> AsyncGenerator[DepthFrame, None]:
+        """See `DepthSource`."""
+        period_ns = round(NS_PER_S / FPS)
+        number, due_ns = 0, monotonic_ns()
+        while True:
+            await asyncio.sleep(max(due_ns - monotonic_ns(), 0) / NS_PER_S)
+            captured_at_ns = monotonic_ns()
+            yield DepthFrame(await asyncio.to_thread(np.load, self._image), captured_at_ns, number)
+            number += 1
+            due_ns = max(due_ns + period_ns, captured_at_ns)
+
+
+def make_source(config: SourceConfig) -> DepthSource:
+    """The source of a configuration whose kind is `recorded`."""
+    assert isinstance(config, RecordedSourceConfig)
+    return PictureSource(config)
+
+
+if __name__ == "__main__":
+    edge_unit.source_factory.make_source = make_source
+    sys.exit(main(["run", *sys.argv[1:]]))

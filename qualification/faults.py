@@ -1,0 +1,649 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`make faults`: what the map says while processes, clocks, networks and disks fail.
+
+Each fault strikes a real master with two real units and a robot's controller. As it strikes, something comes to a
+place that only the unit in trouble can see; an observer asks for the map every 10 ms all the while, and no answer may
+call that place free once its last view has gone stale. Prints the table, and at the end all of it as one line of JSON;
+exits with 1 when a mark is missed. `ARGS="unit-killed"` tries one by name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import errno
+import shutil
+import signal
+import sys
+import tempfile
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from benchmarks.reporting.report import Mark, Result, line, write
+from edge_unit.config import ENVIRONMENT_PREFIX as UNIT_PREFIX
+from qualification.fault_site.clock import WallClock, monotonic_elsewhere
+from qualification.fault_site.site import ADDRESSES, SERIALS, FaultError, Site, registered, until
+from qualification.fault_site.watch import (
+    NOTICED_S_MAX,
+    POLL_S,
+    RECOVERED_S_MAX,
+    SLACK_S,
+    STALE_AFTER_S,
+    Verdict,
+    in_force,
+    judge,
+)
+from qualification.networks import UNIT_IP, Cable, Proxy, confine, run
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.errors import CellwatchError
+from simulation.fleet.fleet import MASTER_PREFIX
+from simulation.fleet.processes import Processes, raise_when_stopped
+
+HOLD_S = 1.5
+"""A fault lasts this long after it could be noticed: long enough for retries to be at their slowest."""
+
+FIRST, SECOND = 0, 1
+
+HOUR_S = 3600
+
+TMPFS_BYTES = 2**20
+
+
+@dataclass
+class Course:
+    """When a fault began and ended, and what else is to be told of it."""
+
+    cause_ns: int = 0
+    noticeable_ns: int = 0
+    """Where that is not when it began."""
+    gone_ns: int = 0
+    lost: list[str] = field(default_factory=list)
+    figures: dict[str, float | str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """`names` is what the map's reason must name; None: there is nothing to notice, the map stays good."""
+
+    name: str
+    what: str
+    names: str | None
+    strike: Callable[[Site, Course], Awaitable[None]]
+    blind: bool = True
+
+
+async def hold(seconds: float = HOLD_S) -> None:
+    """Let it last."""
+    await asyncio.sleep(NOTICED_S_MAX + seconds)
+
+
+async def ordinary(site: Site) -> None:
+    """All on this machine, one address each."""
+    await site.start_master()
+    await site.start_robot()
+    for index in (FIRST, SECOND):
+        await site.start_unit(index)
+    await site.calm()
+
+
+def begin(course: Course) -> None:
+    """Now it strikes."""
+    course.cause_ns = monotonic_ns()
+
+
+async def again(site: Site, course: Course, **how: Any) -> None:
+    """Start the first unit again; the cause is gone when it has registered."""
+    started_ns = monotonic_ns()
+    unit = await site.start_unit(FIRST, **how)
+    await until(lambda: registered(unit), "the unit registers again")
+    course.gone_ns = monotonic_ns()
+    course.figures["process_start_s"] = (course.gone_ns - started_ns) / NS_PER_S
+
+
+# ---------------------------------------------------------------------- processes
+
+
+async def unit_killed(site: Site, course: Course) -> None:
+    """A unit is killed while something comes before it."""
+    await ordinary(site)
+    begin(course)
+    await site.kill(site.units[FIRST])
+    site.newcomer()
+    await hold(0.0)
+    await again(site, course)
+    await site.settled()
+
+
+async def unit_frozen(site: Site, course: Course) -> None:
+    """A unit stands still, and must not show afterwards what it had in hand."""
+    await ordinary(site)
+    begin(course)
+    site.units[FIRST].process.send_signal(signal.SIGSTOP)
+    site.newcomer()
+    await hold()
+    course.gone_ns = monotonic_ns()
+    site.units[FIRST].process.send_signal(signal.SIGCONT)
+    await site.settled()
+
+
+async def robot_silent(site: Site, course: Course) -> None:
+    """The robot's controller stands still."""
+    await ordinary(site)
+    begin(course)
+    site.robot.process.send_signal(signal.SIGSTOP)
+    site.newcomer()
+    await hold()
+    course.gone_ns = monotonic_ns()
+    site.robot.process.send_signal(signal.SIGCONT)
+    await site.settled()
+
+
+async def master_killed(site: Site, course: Course) -> None:
+    """The master is killed, and comes back at the same port."""
+    await ordinary(site)
+    begin(course)
+    await site.kill(site.master)
+    site.newcomer()
+    await hold()
+    await site.start_master()
+    course.gone_ns = monotonic_ns()
+    await site.settled()
+
+
+async def camera_died_meanwhile(site: Site, course: Course) -> None:
+    """The master is killed, and while nobody asks, so is a unit."""
+    await ordinary(site)
+    begin(course)
+    await site.kill(site.master)
+    await site.kill(site.units[FIRST])
+    site.newcomer()
+    await site.start_master()
+    # From here on it can be asked, and must miss the camera.
+    course.noticeable_ns = monotonic_ns()
+    await hold()
+    await again(site, course)
+    await site.settled()
+
+
+# ---------------------------------------------------------------------- clocks
+
+
+def wall_clock(index: int | None, by_s: int) -> Callable[[Site, Course], Awaitable[None]]:
+    """The wall clock of a unit (None: of the master) jumps."""
+
+    async def strike(site: Site, course: Course) -> None:
+        clock = WallClock(site.folder / "clock")
+        await site.start_master(clock.environment if index is None else None)
+        await site.start_robot()
+        for each in (FIRST, SECOND):
+            await site.start_unit(each, variables=clock.environment if each == index else None)
+        await site.calm()
+        begin(course)
+        clock.jump(by_s)
+        site.newcomer()
+        course.gone_ns = course.cause_ns
+        await hold()
+        await site.settled()
+
+    return strike
+
+
+def monotonic_clock(by_s: int) -> Callable[[Site, Course], Awaitable[None]]:
+    """A unit is started again, and its monotonic clock begins elsewhere, as that of another board."""
+
+    async def strike(site: Site, course: Course) -> None:
+        await ordinary(site)
+        begin(course)
+        await site.kill(site.units[FIRST])
+        site.newcomer()
+        await hold(0.0)
+        await again(site, course, under=monotonic_elsewhere(by_s))
+        await site.settled()
+
+    return strike
+
+
+# ---------------------------------------------------------------------- networks
+
+
+async def network_cut(site: Site, course: Course) -> None:
+    """A unit in a network namespace of its own loses its cable."""
+    cable = Cable()
+    try:
+        site.host = "0.0.0.0"
+        await site.start_master()
+        await site.start_robot()
+        await site.start_unit(FIRST, f"http://10.77.0.1:{site.port}", UNIT_IP, cable.under)
+        await site.start_unit(SECOND)
+        await site.calm()
+        begin(course)
+        cable.pull()
+        site.newcomer()
+        await hold(2.0 * HOLD_S)
+        course.gone_ns = monotonic_ns()
+        cable.plug()
+        await site.settled()
+    finally:
+        cable.close()
+
+
+async def by_proxy(site: Site) -> Proxy:
+    """The first unit reaches the master through a proxy."""
+    await site.start_master()
+    proxy = Proxy(site.port, ADDRESSES[FIRST])
+    await proxy.open()
+    await site.start_robot()
+    await site.start_unit(FIRST, proxy.url)
+    await site.start_unit(SECOND)
+    await site.calm()
+    return proxy
+
+
+async def network_slow(site: Site, course: Course) -> None:
+    """What it sends is 150 to 250 ms under way."""
+    proxy = await by_proxy(site)
+    try:
+        begin(course)
+        proxy.delay_s, proxy.jitter_s = 0.2, 0.05
+        site.newcomer()
+        await hold(2.0 * HOLD_S)
+        ages = [a.age_s for a in site.asker.answers if a.age_s is not None and a.got_ns > course.cause_ns]
+        course.figures["oldest_view_s_max"] = max(ages)
+        course.gone_ns = monotonic_ns()
+        proxy.delay_s = proxy.jitter_s = 0.0
+        await site.settled()
+    finally:
+        await proxy.close()
+
+
+async def connections_cut(site: Site, course: Course) -> None:
+    """Every connection of a unit is reset, three times a second."""
+    proxy = await by_proxy(site)
+    try:
+        begin(course)
+        site.newcomer()
+        for _ in range(10):
+            proxy.cut()
+            await asyncio.sleep(0.3)
+        proxy.cut()
+        course.gone_ns = monotonic_ns()
+        await site.settled()
+    finally:
+        await proxy.close()
+
+
+def replayed(path: str) -> Callable[[Site, Course], Awaitable[None]]:
+    """What a unit sent before is sent again from its own address."""
+
+    async def strike(site: Site, course: Course) -> None:
+        proxy = await by_proxy(site)
+        try:
+            requests = [one for one in proxy.sent if one.startswith(f"POST {path} ".encode())]
+            if not requests:
+                raise FaultError(f"no POST {path} was recorded")
+            site.newcomer()
+            await site.settled()
+            begin(course)
+            answer = await send_again(requests[-1], site.port)
+            course.gone_ns = monotonic_ns()
+            course.figures["answered"] = answer
+            await hold(0.0)
+            await site.settled()
+        finally:
+            await proxy.close()
+
+    return strike
+
+
+async def send_again(request: bytes, port: int) -> str:
+    """The status that the bytes of a request are answered with, sent from the first unit's address."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", port, local_addr=(ADDRESSES[FIRST], 0))
+    writer.write(request)
+    status = (await reader.readline()).split()[1].decode()
+    writer.close()
+    with suppress(ConnectionError):
+        await writer.wait_closed()
+    return status
+
+
+# ---------------------------------------------------------------------- disks
+
+
+def tmpfs(folder: Path) -> Path:
+    """A tiny disk at `folder`, in our own mount namespace."""
+    folder.mkdir(parents=True, exist_ok=True)
+    run("mount", "-t", "tmpfs", "-o", f"size={TMPFS_BYTES}", "tmpfs", str(folder))
+    return folder
+
+
+def fill(folder: Path) -> Path:
+    """Write until nothing goes any more; returns the file that takes all the room."""
+    path = folder / "full"
+    with path.open("wb", buffering=0) as file:
+        try:
+            while True:
+                file.write(bytes(4096))
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise
+    return path
+
+
+async def master_disk_full(site: Site, course: Course) -> None:
+    """While it is full an operator changes a setting; when there is room again the master is killed and restarted."""
+    disk = tmpfs(site.master_state)
+    try:
+        await ordinary(site)
+        begin(course)
+        full = fill(disk)
+        site.newcomer()
+        response = await site.operator.put("/settings", json={"margin_base_m": 0.032})
+        course.figures["answered"] = str(response.status_code)
+        if response.is_success:
+            site.expect("settings", response.json())
+        await hold()
+        course.gone_ns = monotonic_ns()
+        full.unlink()
+        await site.settled()
+        # What was acknowledged must be there after a crash, too.
+        await site.look_away()
+        await site.kill(site.master)
+        await site.start_master()
+        course.lost = await site.lost()
+    finally:
+        run("umount", "--lazy", str(disk))
+
+
+async def unit_disk_full(site: Site, course: Course) -> None:
+    """A unit whose disk is full from the start is killed and started again."""
+    disk = tmpfs(site.state_dirs[FIRST])
+    try:
+        fill(disk)
+        await ordinary(site)
+        begin(course)
+        await site.kill(site.units[FIRST])
+        site.newcomer()
+        await hold(0.0)
+        await again(site, course)
+        await site.settled()
+    finally:
+        run("umount", "--lazy", str(disk))
+
+
+# ---------------------------------------------------------------------- identities
+
+
+async def units_swapped(site: Site, course: Course) -> None:
+    """Both units are started again with each other's address; then an operator tells where the cameras are."""
+    await swap_addresses(site, course)
+    for unit in [await site.start_unit(index) for index in (FIRST, SECOND)]:
+        await until(partial(registered, unit), "the swapped units register")
+    await hold()
+    course.gone_ns = monotonic_ns()
+    await tell_poses(site)
+
+
+async def address_taken(site: Site, course: Course) -> None:
+    """The first unit comes back with the address of the second, which is gone for now; an operator tells its pose."""
+    await swap_addresses(site, course)
+    unit = await site.start_unit(FIRST)
+    await until(partial(registered, unit), "the unit registers with the other's address")
+    await site.give_poses()
+    await hold()
+    unit = await site.start_unit(SECOND)
+    await until(partial(registered, unit), "the other unit registers")
+    course.gone_ns = monotonic_ns()
+    await tell_poses(site)
+
+
+async def swap_addresses(site: Site, course: Course) -> None:
+    """Both units are killed; whichever is started again has the other's address."""
+    await ordinary(site)
+    begin(course)
+    for unit in site.units:
+        await site.kill(unit)
+    site.newcomer()
+    site.addresses.reverse()
+
+
+async def tell_poses(site: Site) -> None:
+    """An operator tells where the cameras are, which the master is to keep from now on."""
+    await site.give_poses()
+    acknowledged = await site.acknowledged()
+    for serial in SERIALS:
+        site.expect(serial, acknowledged[serial])
+    await site.settled()
+
+
+async def token_revoked(site: Site, course: Course) -> None:
+    """The units' token is replaced at the master and at the second unit; the first one learns it later."""
+    await ordinary(site)
+    token = "another-token-of-the-units-0123456789abcdef"
+    replace(site.tokens[SECOND], token)
+    begin(course)
+    replace(site.unit_token, token)
+    site.newcomer()
+    await hold()
+    course.gone_ns = monotonic_ns()
+    replace(site.tokens[FIRST], token)
+    await site.settled()
+
+
+def replace(path: Path, text: str) -> None:
+    """Write a file whole."""
+    written = path.with_suffix(".new")
+    written.write_text(text + "\n")
+    written.chmod(0o600)
+    written.rename(path)
+
+
+ONE = f"({ADDRESSES[FIRST]})"
+
+FAULTS: tuple[Fault, ...] = (
+    Fault("unit-killed", "a unit is killed and started again", ONE, unit_killed),
+    Fault("unit-frozen", "a unit stands still (SIGSTOP, SIGCONT)", ONE, unit_frozen),
+    Fault("wall-clock-ahead", "a unit's wall clock jumps 1 h ahead", None, wall_clock(FIRST, HOUR_S), False),
+    Fault("wall-clock-back", "a unit's wall clock jumps 1 h back", None, wall_clock(FIRST, -HOUR_S), False),
+    Fault("master-wall-clock", "the master's wall clock jumps 1 h back", None, wall_clock(None, -HOUR_S), False),
+    Fault("monotonic-elsewhere", "a unit's monotonic clock starts 11 days ahead", ONE, monotonic_clock(10**6)),
+    Fault("network-cut", "a unit's network cable is pulled, and plugged in", f"({UNIT_IP})", network_cut),
+    Fault("network-slow", "what a unit sends is 200 ms (+-50) under way", None, network_slow, False),
+    Fault("connections-cut", "a unit's connections are reset, 3 times a second", None, connections_cut, False),
+    Fault("master-killed", "the master is killed and started again", "", master_killed),
+    Fault("camera-died-meanwhile", "... and a unit dies while it is down", ONE, camera_died_meanwhile),
+    Fault("master-disk-full", "the master's disk is full", None, master_disk_full, False),
+    Fault("unit-disk-full", "a unit restarts on a full disk", ONE, unit_disk_full),
+    Fault("units-swapped", "two units come back with each other's address", ONE, units_swapped),
+    Fault("address-taken", "a unit comes back with the address of one that is gone", ONE, address_taken),
+    Fault("update-replayed", "an old update of a unit is sent again", None, replayed("/update"), False),
+    Fault("registration-replayed", "an old registration of a unit is sent again", None, replayed("/initialize"), False),
+    Fault("token-revoked", "the units' token is replaced; a unit learns it later", ONE, token_revoked),
+    Fault("robot-silent", "the robot does not report, then does again", "robot", robot_silent),
+)
+
+
+async def strike(fault: Fault) -> dict[str, Any]:
+    """One fault from the first process to the last; its row.
+
+    Raises:
+        CellwatchError: it could not be measured.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="cellwatch-faults-"))
+    try:
+        async with Processes(folder / "logs", without=(UNIT_PREFIX, MASTER_PREFIX)) as processes:
+            site, course = Site(folder, processes), Course()
+            trouble = ""
+            try:
+                await fault.strike(site, course)
+                course.lost = course.lost or await site.lost()
+            except FaultError as error:
+                if not course.gone_ns:
+                    raise
+                trouble = str(error)
+                course.lost = course.lost or await site.lost()
+            finally:
+                await site.look_away()
+            return row(fault, site, course, trouble)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def row(fault: Fault, site: Site, course: Course, trouble: str) -> dict[str, Any]:
+    """What is told of a fault."""
+    polled, streamed = (
+        judge(
+            answers,
+            site.present,
+            course.cause_ns,
+            course.noticeable_ns or course.cause_ns,
+            course.gone_ns,
+            fault.names,
+            fault.blind,
+            len(SERIALS),
+        )
+        for answers in (site.asker.answers, in_force(site.listener.answers))
+    )
+    false = polled.false_free or (streamed.false_free and f"stream: {streamed.false_free}")
+    return {
+        "name": fault.name,
+        "noticed_s": _rounded(polled.noticed_s),
+        "recovered_s": _rounded(polled.recovered_s),
+        "false_free": bool(false),
+        "lost": len(course.lost),
+        "met": met(fault, polled, course.lost) and not false,
+        "told": polled.told,
+        "stream_noticed_s": _rounded(streamed.noticed_s),
+        "stream_recovered_s": _rounded(streamed.recovered_s),
+        "complete_share": round(polled.complete_share, 3),
+        "answers": len(site.asker.answers),
+        "messages": len(site.listener.answers),
+        **{name: _rounded(value) if isinstance(value, float) else value for name, value in course.figures.items()},
+        **({"first_false": false} if false else {}),
+        **({"forgotten": course.lost} if course.lost else {}),
+        **({"trouble": trouble} if trouble else {}),
+    }
+
+
+def met(fault: Fault, verdict: Verdict, lost: Sequence[str]) -> bool:
+    """Whether all marks are met."""
+    noticed = fault.names is None or (verdict.noticed_s is not None and verdict.noticed_s <= NOTICED_S_MAX)
+    recovered = verdict.recovered_s is not None and verdict.recovered_s <= RECOVERED_S_MAX
+    return noticed and recovered and not verdict.false_free and not lost
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
+
+
+async def strike_all(faults: Sequence[Fault]) -> list[dict[str, Any]]:
+    """One after the other, each told as it is found."""
+    rows = []
+    for fault in faults:
+        rows.append(await strike(fault))
+        print(f"  {fault.name}: {'met' if rows[-1]['met'] else 'MISSED'}", file=sys.stderr, flush=True)
+    return rows
+
+
+def result_of(rows: Sequence[dict[str, Any]]) -> Result:
+    """The table, and what is asked of all faults together."""
+    what = {fault.name: fault.what for fault in FAULTS}
+    columns = (
+        "fault",
+        "what happens",
+        "noticed_s",
+        "recovered_s",
+        "stream: noticed_s",
+        "stream: recovered_s",
+        "false_free",
+        "lost",
+        "mark",
+        "what the map told",
+    )
+    cells = tuple(
+        (
+            each["name"],
+            what[each["name"]],
+            _cell(each["noticed_s"]),
+            _cell(each["recovered_s"]),
+            _cell(each["stream_noticed_s"]),
+            _cell(each["stream_recovered_s"]),
+            "YES" if each["false_free"] else "no",
+            str(each["lost"]),
+            "met" if each["met"] else "MISSED",
+            str(each.get("first_false") or each.get("trouble") or each["told"]).split(";")[0],
+        )
+        for each in rows
+    )
+    started = ", ".join(f"{each['name']} {each['process_start_s']:.3f}" for each in rows if "process_start_s" in each)
+    starts = (f"From the start of a unit's process until it registered, s: {started}.",) if started else ()
+    marks = (
+        Mark("faults after which a mark was missed", float(sum(not each["met"] for each in rows)), at_most=0.0),
+        Mark("longest until it was noticed, s", _longest(rows, "noticed_s"), at_most=NOTICED_S_MAX),
+        Mark("longest until the map was right again, s", _longest(rows, "recovered_s"), at_most=RECOVERED_S_MAX),
+        Mark(
+            "faults that made a map say free of what nobody sees", float(sum(each["false_free"] for each in rows)), 0.0
+        ),
+        Mark("acknowledged things lost", float(sum(each["lost"] for each in rows)), at_most=0.0),
+    )
+    return Result("Faults, with real processes", columns, cells, marks, (*REMARKS, *starts))
+
+
+def _longest(rows: Sequence[dict[str, Any]], name: str) -> float:
+    """Of those in which there was something to notice or to recover from."""
+    return max((each[name] for each in rows if each[name] is not None), default=0.0)
+
+
+REMARKS = (
+    "noticed_s: from the cause to the first answer that is not complete and names what is missing (-: there is nothing",
+    f"to notice); at most {NOTICED_S_MAX:.3f}: {STALE_AFTER_S:g} until a view is stale, one frame period, {POLL_S:g} "
+    f"between questions, {SLACK_S:g} for scheduling.",
+    "recovered_s: from when the cause is gone (a process: registered, or listening) to a map that stays complete and",
+    f"right; at most {RECOVERED_S_MAX:g}.",
+    "false_free: an answer said, or implied, that a place which nobody sees is free.",
+    "lost: ids, poses or settings that were acknowledged, and are not there any more.",
+)
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run; exit code 1 when a mark is missed."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    options = _parser().parse_args(arguments)
+    try:
+        if not options.inside:
+            confine("qualification.faults", arguments)
+        raise_when_stopped()
+        run("ip", "link", "set", "lo", "up")
+        chosen = [fault for fault in FAULTS if not options.names or fault.name in options.names]
+        rows = asyncio.run(strike_all(chosen))
+    except CellwatchError as error:
+        print(f"make faults: {error}", file=sys.stderr, flush=True)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    result = result_of(rows)
+    document = {"faults": rows}
+    if not options.names:
+        write("faults", result.document() | document)
+    print(result)
+    print(line(document))
+    return 0 if all(mark.met for mark in result.marks) else 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="make faults", description=(__doc__ or "").split("\n\n")[1])
+    names = [fault.name for fault in FAULTS]
+    parser.add_argument("names", nargs="*", choices=[*names, []], metavar="NAME", help=", ".join(names))
+    parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Machines that boot, for `make rehearsal` and `make image-test`.
+
+In the order of the flow:
+
+    hanging_unit  what runs on a machine whose frame hangs
+    containers    machines that boot systemd from one read-only root file system
+    image_parts   the image that arm64 boards boot in QEMU, built as a board's is
+    arm64_boards  an arm64 board in QEMU
+"""

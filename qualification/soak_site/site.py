@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A cell that all sorts of things happen to at once, and how each of them is done and undone."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import signal
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from contextlib import AsyncExitStack, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import yaml
+from websockets.asyncio.client import connect
+from websockets.exceptions import WebSocketException
+
+from edge_unit.sources.simulated import SimulatedSourceConfig
+from qualification.fault_site.clock import WallClock
+from qualification.fault_site.scene import FPS, IMAGE, NEWCOMER, RESIDENTS, T_WORLD_CAMERA, Thing, show
+from qualification.fault_site.site import ADDRESSES, FaultError, Site
+from qualification.fault_site.watch import SLACK_S, STALE_AFTER_S, Answer, Asker, Listener, Observer
+from qualification.networks import MASTER_IP, UNIT_IP, Cable
+from qualification.soak_site.schedule import Kind
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.waiting import within
+from simulation.fleet.processes import Child
+
+GRACE_NS = round((STALE_AFTER_S + 1.0 / FPS + SLACK_S) * NS_PER_S)
+"""After a change of the scene the map may tell of before it for so long."""
+
+HOUR_S = 3600
+
+STREAMS = 6
+"""Readers that come at once; every other of them reads nothing."""
+
+AGAIN_S = 0.05
+"""Between attempts of an operator whose master is gone."""
+
+VOXEL_SIZES_M = (0.04, 0.03, 0.05)
+
+READ_S = 1.0
+"""Twice the stream's heartbeat."""
+
+RECENT = 200
+"""Answers that are kept after they were judged."""
+
+KINDS: Mapping[str, Kind] = {
+    "unit 1 killed": Kind("unit 1", 1.0),
+    "unit 1 stopped by its service": Kind("unit 1", 1.0),
+    "unit 1 stands still": Kind("unit 1", 1.0),
+    "unit 2 killed": Kind("unit 2", 0.5, early=True),
+    "unit 2 stands still": Kind("unit 2", 1.0),
+    "master killed": Kind("master", 0.7, early=True),
+    "master stands still": Kind("master", 0.7),
+    "robot silent": Kind("robot", 1.0),
+    "camera 1 unplugged": Kind("camera 1", 1.0),
+    "camera 2 unplugged": Kind("camera 2", 1.0),
+    "cable pulled": Kind("cable", 1.0),
+    "wall clocks step": Kind("clock", 1.0),
+    "readers come and stall": Kind("readers", 1.0),
+    "a setting changes": Kind("settings", 0.7),
+    "the voxel size changes": Kind("settings", 0.7),
+    "an operator looks around": Kind("operator", 1.0),
+    "somebody comes by": Kind("newcomer", 2.0),
+}
+
+
+@dataclass
+class Camera:
+    """What one camera sees, and whether it is plugged in."""
+
+    folder: Path
+    things: tuple[Thing, ...]
+    plugged: bool = True
+
+    def update(self) -> None:
+        """From the next frame on it is so."""
+        if self.plugged:
+            show(self.folder, *self.things)
+        else:
+            (self.folder / IMAGE).unlink(missing_ok=True)
+
+
+class Scene:
+    """What stood in the cell at any time."""
+
+    def __init__(self) -> None:
+        names = frozenset(thing.name for thing in RESIDENTS)
+        self._since: deque[tuple[int, frozenset[str], frozenset[str]]] = deque(((0, names, names),), maxlen=RECENT)
+
+    def change(self, certainly: Iterable[str], perhaps: Iterable[str] = ()) -> None:
+        """From now on these stand there, of others it is `perhaps` so: they are about to come or to go."""
+        certain = frozenset(certainly)
+        self._since.append((monotonic_ns(), certain, certain.union(perhaps)))
+
+    def around(self, now_ns: int) -> tuple[frozenset[str], frozenset[str]]:
+        """What stood there at all moments of the GRACE_NS before `now_ns`, and at any of them."""
+        always, ever = None, frozenset[str]()
+        for since_ns, certain, possible in reversed(self._since):
+            if since_ns <= now_ns:
+                always = certain if always is None else always & certain
+                ever |= possible
+            if since_ns <= now_ns - GRACE_NS:
+                break
+        return always or frozenset(), ever
+
+    def wrong(self, answer: Answer) -> str:
+        """What an answer says that is not so, in words; empty when all of it is."""
+        if answer.now_ns is None:
+            return ""
+        always, ever = self.around(answer.now_ns)
+        if false := always & answer.free:
+            return f"free although there is the {', '.join(sorted(false))}"
+        if not answer.complete:
+            return ""
+        if missed := always - answer.held:
+            return f"complete without the {', '.join(sorted(missed))}"
+        if ghosts := answer.held - ever:
+            return f"complete with the {', '.join(sorted(ghosts))}, which is not there"
+        if answer.units_live != len(ADDRESSES):
+            return f"complete with {answer.units_live} of {len(ADDRESSES)} units"
+        return ""
+
+
+@dataclass(eq=False)
+class SoakSite(Site):
+    """A site whose first unit is at the other end of a cable, and whose wall clocks may be set."""
+
+    scene: Scene = field(init=False, default_factory=Scene)
+    wrongs: list[str] = field(init=False, default_factory=list)
+    judged: int = field(init=False, default=0)
+    ended: list[str] = field(init=False, default_factory=list)
+    """What ended by itself."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.host = "0.0.0.0"
+        self.eyes = [Camera(folder, (thing,)) for folder, thing in zip(self.cameras, RESIDENTS, strict=True)]
+        for folder, pose in zip(self.cameras, T_WORLD_CAMERA, strict=True):
+            (folder / "T_base_optical.txt").write_text("\n".join(" ".join(map(str, row)) for row in pose))
+        self._cable = Cable()
+        self._clocks = [WallClock(self.folder / f"clock{number}") for number in range(3)]
+
+    # ------------------------------------------------------------------ starting
+
+    async def start(self) -> None:
+        """Start everything, and begin to watch."""
+        await self.start_master(self._clocks[0].environment)
+        await self.start_robot()
+        for index in range(len(ADDRESSES)):
+            await self.start_soaked(index)
+        things = (*RESIDENTS, NEWCOMER)
+        self.asker, self.listener = Asker(self.port, things), Listener(self.port, things)
+        self.watching = [self.asker, self.listener]
+        for observer in self.watching:
+            observer.start()
+
+    async def start_soaked(self, index: int) -> None:
+        """Start a unit before its camera."""
+        source = SimulatedSourceConfig(camera=index, handling=self.cameras[index] / IMAGE)
+        if not self.tokens[index].exists():
+            self.tokens[index].write_text(self.unit_token.read_text())
+        document = {
+            "source": source.model_dump(mode="json", include={"kind", "camera", "handling"}),
+            "master_url": f"http://{MASTER_IP if index == 0 else '127.0.0.1'}:{self.port}",
+            "token_file": str(self.tokens[index]),
+            "state_dir": str(self.state_dirs[index]),
+            "source_address": UNIT_IP if index == 0 else ADDRESSES[index],
+        }
+        config = self.folder / f"unit{index + 1}.yaml"
+        config.write_text(yaml.safe_dump(document))
+        child = await self.processes.start(
+            self._name(f"unit{index + 1}"), "qualification.soak_site.unit", str(config),
+            under=self._cable.under if index == 0 else (),
+            variables=self._clocks[index + 1].environment,
+        )  # fmt: skip
+        self.units[index : index + 1] = [child]
+
+    def close(self) -> None:
+        """Take the cable away."""
+        self._cable.close()
+
+    def running(self) -> Iterator[tuple[str, int]]:
+        """Names and ids of all processes that run, for whoever looks at their usage."""
+        for name, child in (("master", self.master), ("robot", self.robot), *self._named_units()):
+            if not child.ended:
+                yield name, child.pid
+
+    def _named_units(self) -> Iterator[tuple[str, Child]]:
+        return ((f"unit {number}", child) for number, child in enumerate(self.units, 1))
+
+    # ------------------------------------------------------------------ judging
+
+    def begin_judging(self) -> None:
+        """What was answered before does not count."""
+        for observer in self.watching:
+            observer.answers.clear()
+        self.wrongs, self.judged = [], 0
+
+    def judge(self) -> None:
+        """Hold what was answered since the last time against the scene, and see who ended by itself."""
+        for observer in self.watching:
+            # Its thread adds to them meanwhile.
+            old = observer.answers[:-RECENT]
+            del observer.answers[: len(old)]
+            self._judge(observer, old)
+        for child in self.processes:
+            if child.failed:
+                child.may_end = True
+                self.ended.append(f"{child.name}: {child.ended}; {child.log_tail()}")
+
+    def judge_all(self) -> None:
+        """As `judge`, at the end."""
+        self.judge()
+        for observer in self.watching:
+            self._judge(observer, observer.answers)
+
+    def _judge(self, observer: Observer, answers: Iterable[Answer]) -> None:
+        for answer in answers:
+            self.judged += 1
+            if wrong := self.scene.wrong(answer):
+                self.wrongs.append(f"{type(observer).__name__}, {answer.now_ns}: {wrong}")
+
+    async def voxels(self) -> tuple[Any, ...] | None:
+        """The map, when it is complete and all units are in it; None when it is not."""
+        with suppress(httpx.HTTPError):
+            answer = (await self.operator.get("/voxels?form=keys")).raise_for_status().json()
+            if answer["complete"] and answer["units_live"] == len(ADDRESSES):
+                return answer["lattice"], answer["voxels"], answer["witnesses"]
+        return None
+
+    # ------------------------------------------------------------------ what happens
+
+    async def strike(self, name: str, hold: Callable[[], Awaitable[None]], draw: random.Random) -> None:
+        """Do what is called so, `hold`, and undo it."""
+        what, _, rest = name.partition(" ")
+        if name in ("unit 1 killed", "unit 2 killed", "unit 1 stopped by its service"):
+            await self._unit_again(int(rest[0]) - 1, "killed" in name, hold)
+        elif name.endswith("stands still") or name == "robot silent":
+            child = {"master": self.master, "robot": self.robot}.get(what) or self.units[int(rest[0]) - 1]
+            child.process.send_signal(signal.SIGSTOP)
+            await hold()
+            child.process.send_signal(signal.SIGCONT)
+        elif name == "master killed":
+            await self.kill(self.master)
+            await hold()
+            before = self.operator
+            await self.start_master(self._clocks[0].environment)
+            await before.aclose()
+        elif what == "camera":
+            await self._unplugged(self.eyes[int(rest[0]) - 1], hold)
+        elif name == "cable pulled":
+            self._cable.pull()
+            await hold()
+            self._cable.plug()
+        elif name == "wall clocks step":
+            for clock in self._clocks:
+                clock.jump(draw.choice((-HOUR_S, HOUR_S, 24 * HOUR_S)))
+            await hold()
+            for clock in self._clocks:
+                clock.jump(0)
+        elif name == "readers come and stall":
+            await self._readers(hold)
+        elif name == "a setting changes":
+            await self._settings({"margin_base_m": 0.033}, {"margin_base_m": 0.03}, hold)
+        elif name == "the voxel size changes":
+            await self._settings({"voxel_size_m": draw.choice(VOXEL_SIZES_M)}, {"voxel_size_m": 0.05}, hold)
+        elif name == "an operator looks around":
+            await self._look_around()
+        elif name == "somebody comes by":
+            await self._newcomer(hold)
+        else:
+            raise FaultError(f"nobody knows how to do this: {name}")
+
+    async def _unit_again(self, index: int, kill: bool, hold: Callable[[], Awaitable[None]]) -> None:
+        unit = self.units[index]
+        if kill:
+            await self.kill(unit)
+        else:
+            await self.processes.stop(unit)
+        await hold()
+        await self.start_soaked(index)
+
+    async def _unplugged(self, camera: Camera, hold: Callable[[], Awaitable[None]]) -> None:
+        camera.plugged = False
+        camera.update()
+        await hold()
+        camera.plugged = True
+        camera.update()
+
+    async def _newcomer(self, hold: Callable[[], Awaitable[None]]) -> None:
+        camera, residents = self.eyes[0], [thing.name for thing in RESIDENTS]
+        # Between the picture and our word for it this process may have to wait for its core.
+        self.scene.change(residents, (NEWCOMER.name,))
+        camera.things = (RESIDENTS[0], NEWCOMER)
+        camera.update()
+        self.scene.change((*residents, NEWCOMER.name))
+        await hold()
+        self.scene.change(residents, (NEWCOMER.name,))
+        camera.things = (RESIDENTS[0],)
+        camera.update()
+        self.scene.change(residents)
+
+    async def _settings(
+        self, changed: dict[str, float], usual: dict[str, float], hold: Callable[[], Awaitable[None]]
+    ) -> None:
+        await self._insist(changed)
+        await hold()
+        await self._insist(usual)
+
+    async def _insist(self, settings: dict[str, float]) -> None:
+        """Until the master has acknowledged it."""
+        while True:
+            with suppress(httpx.HTTPError):
+                (await self.operator.put("/settings", json=settings)).raise_for_status()
+                return
+            await asyncio.sleep(AGAIN_S)
+
+    async def _look_around(self) -> None:
+        """Everything that somebody may ask for; whether it can be had now is not the question."""
+        with suppress(httpx.HTTPError):
+            for path in ("/metrics", "/coverage?blocks=true", "/robot", "/cell", "/voxels?form=centres&unseen=true"):
+                await self.operator.get(path)
+            for row in (await self.operator.get("/units")).raise_for_status().json():
+                for kind in ("depth", "expected", "foreground"):
+                    await self.operator.get(f"/units/{row['id']}/images/{kind}", timeout=10.0)
+                await self.operator.post(f"/units/{row['id']}/refine")
+
+    async def _readers(self, hold: Callable[[], Awaitable[None]]) -> None:
+        """Readers of the stream that go without a word; every other never took a message."""
+        ended = asyncio.Event()
+
+        async def read(number: int) -> None:
+            address = f"ws://127.0.0.1:{self.port}/stream?unseen=true"
+            with suppress(OSError, TimeoutError, WebSocketException):
+                async with AsyncExitStack() as stack:
+                    stream = await stack.enter_async_context(connect(address, proxy=None, open_timeout=2.0))
+                    stack.callback(stream.transport.abort)
+                    while not ended.is_set():
+                        await within(READ_S, ended.wait() if number % 2 else stream.recv())
+
+        readers = [asyncio.ensure_future(read(number)) for number in range(STREAMS)]
+        await hold()
+        ended.set()
+        await asyncio.gather(*readers)

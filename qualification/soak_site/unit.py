@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`python -m qualification.soak_site.unit CONFIG.YAML`: the edge unit before a camera that may be unplugged.
+
+All but the source is the daemon as it is installed. It takes whatever picture lies beside the `handling` of a simulated
+camera; where there is none, the camera is gone.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import AsyncGenerator
+
+import edge_unit.source_factory
+from edge_unit.__main__ import main
+from edge_unit.config import SourceConfig
+from edge_unit.sources import CameraInfo, DepthFrame, DepthSource
+from edge_unit.sources.recorded import RecordedSourceConfig
+from edge_unit.sources.simulated import SimulatedSourceConfig
+from qualification.fault_site.scene import FPS
+from qualification.fault_site.unit import PictureSource
+from shared.errors import SourceError
+
+
+class PluggedSource(PictureSource):
+    """A camera that is there while its picture is."""
+
+    async def open(self) -> CameraInfo:
+        """See `DepthSource`."""
+        if not self._image.exists():
+            raise SourceError(f"{self._image.parent.name}: it is not plugged in")
+        return await super().open()
+
+    async def frames(self) -> AsyncGenerator[DepthFrame, None]:
+        """See `DepthSource`."""
+        frames = super().frames()
+        try:
+            async for frame in frames:
+                yield frame
+        except FileNotFoundError as error:
+            raise SourceError(f"{self._image.parent.name}: it was unplugged") from error
+        finally:
+            await frames.aclose()
+
+
+def make_source(config: SourceConfig) -> DepthSource:
+    """The source of a configuration whose kind is `simulated`."""
+    assert isinstance(config, SimulatedSourceConfig)
+    assert config.handling is not None
+    return PluggedSource(RecordedSourceConfig(folder=config.handling.parent, serial=config.serial, fps=FPS))
+
+
+if __name__ == "__main__":
+    edge_unit.source_factory.make_source = make_source
+    sys.exit(main(["run", *sys.argv[1:]]))

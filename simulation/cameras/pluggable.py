@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""RealSense cameras that can be plugged in and out, as file devices on the SDK's context.
+
+A file says which recordings are plugged in now, one path a line. This is the unit's capture process but for the
+socket into which they are plugged, so all that the unit does about a camera that comes and goes is done for real.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+import threading
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import pyrealsense2 as rs
+
+from edge_unit.sources.realsense import capture_link as link
+from edge_unit.sources.realsense.capture import Capture
+from edge_unit.sources.realsense.capture_process import main
+from shared.files import write_whole
+
+LOOK_EVERY_S = 0.02
+
+
+def command(sockets: Path) -> tuple[str, ...]:
+    """The capture command of a `RealsenseSource` whose cameras are those of the file `sockets`."""
+    return sys.executable, "-m", "simulation.cameras.pluggable", str(sockets)
+
+
+def plug(sockets: Path, recordings: Iterable[Path]) -> None:
+    """From now on these recordings are plugged in, and no other."""
+    write_whole(sockets, "".join(f"{recording}\n" for recording in recordings).encode(), synced=False)
+
+
+class Sockets:
+    """What is plugged in, on a context."""
+
+    def __init__(self, sockets: Path, context: rs.context) -> None:
+        self._sockets = sockets
+        self._context = context
+        self._plugged: dict[str, object] = {}
+
+    def look(self) -> None:
+        """Plug in and out as the file says."""
+        wanted = self._sockets.read_text().split() if self._sockets.is_file() else []
+        for path in self._plugged.keys() - set(wanted):
+            self._context.unload_device(path)
+            del self._plugged[path]
+        for path in set(wanted) - self._plugged.keys():
+            # The SDK forgets a device that nobody holds.
+            self._plugged[path] = self._context.load_device(path)
+
+    def follow(self) -> None:
+        """Look for ever."""
+        pause = threading.Event()
+        while not pause.wait(LOOK_EVERY_S):
+            self.look()
+
+
+def serve(end: socket.socket) -> None:
+    """Capture from whatever is plugged in; a camera does not end, so its recording begins again."""
+    received = link.receive(end)
+    if received is None or not isinstance(received[0], link.Request):
+        return
+    context = rs.context()
+    sockets = Sockets(Path(sys.argv[1]), context)
+    sockets.look()
+    capture = Capture(end, replace(received[0], loop=True), context)
+    threading.Thread(target=sockets.follow, name="sockets", daemon=True).start()
+    capture.run()
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[2]), int(sys.argv[3]), serve)

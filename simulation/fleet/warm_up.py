@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiles every kernel that a simulated unit needs into the cache, so that many units need not do it at once.
+
+`python -m simulation.fleet.warm_up` takes a minute the first time, and a few seconds when all is compiled.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge_unit.pipeline import DepthPipeline
+from simulation.cameras.camera import SimulatedCamera, d435i_intrinsics, rig
+from simulation.cameras.truth import TruthFinder
+from simulation.world.world import World
+
+
+def warm_up() -> None:
+    """Run everything once. Kernels are compiled for types, not for sizes: any resolution will do."""
+    world = World.demo()
+    intrinsics = d435i_intrinsics(424, 240)
+    pose = rig(world.cell)[0]
+    pipeline = DepthPipeline(intrinsics, pose, world.cell)
+    camera = SimulatedCamera(world, pose, intrinsics)
+    finder = TruthFinder(intrinsics, pose, pipeline.lattice, camera.noise)
+    frame = camera.capture(0.0)
+    finder.find(frame.view)
+    pipeline.process(np.zeros(intrinsics.shape, np.uint16), frame.joints)
+    pipeline.process(frame.depth, frame.joints)
+    pipeline.health()
+    pipeline.seen()
+
+
+if __name__ == "__main__":
+    warm_up()

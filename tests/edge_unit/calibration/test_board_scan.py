@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Looking for the board: by the simulated camera, and through a source that shows what we want."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncGenerator, AsyncIterator
+from contextlib import asynccontextmanager
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from edge_unit.calibration.board_layout import BoardLayout
+from edge_unit.calibration.board_scan import EMPTY_FRAMES, FRAMES, GOOD_FRAMES, RETRY_MIN_S, BoardSearch
+from edge_unit.sources.image import ImageFrame, ImageInfo, ImageStream
+from edge_unit.sources.simulated import SimulatedSource, SimulatedSourceConfig
+from shared.camera import Intrinsics
+from shared.cell import Board, Cell
+from shared.clock import monotonic_ns
+from shared.errors import BoardError, SourceError
+from shared.transforms import angle_rad, from_rotation_translation, identity, inverse, rotation_about
+from simulation.cameras.board_picture import BoardCamera, BoardPicture
+from simulation.cameras.camera import rig
+from simulation.world.world import DEMO_CELL, World
+
+CAMERA = Intrinsics(640, 480, 600.0, 600.0, 320.0, 240.0)
+BOARD = Board("grid", 3, 4, 0.08, 0.06, "DICT_4X4_50", 0, identity())
+T_CAMERA_BOARD = from_rotation_translation(rotation_about((1.0, 0.5, 0.0), 0.5), (-0.1, -0.1, 0.9))
+EMPTY = np.full(CAMERA.shape, 90, np.uint8)
+
+
+class Pictures:
+    """A source that shows these pictures, over and over."""
+
+    def __init__(self, *pictures: NDArray[np.uint8]) -> None:
+        self.info = ImageInfo("infrared", CAMERA, (0.0,) * 5, "brown_conrady", identity())
+        self.pictures = pictures
+        self.taken = 0
+        self.looking = False
+
+    @asynccontextmanager
+    async def look(self, stream: ImageStream) -> AsyncIterator[Pictures]:
+        self.looking = True
+        try:
+            yield self
+        finally:
+            self.looking = False
+
+    async def images(self) -> AsyncGenerator[ImageFrame, None]:
+        while self.pictures:
+            yield ImageFrame(self.pictures[self.taken % len(self.pictures)], monotonic_ns(), self.taken)
+            self.taken += 1
+
+
+@pytest.fixture(scope="module")
+def demo() -> Cell:
+    return Cell.load(DEMO_CELL)
+
+
+def board_picture() -> NDArray[np.uint8]:
+    picture = BoardPicture(BoardLayout.of(BOARD), CAMERA)
+    return picture.develop(picture.expose(T_CAMERA_BOARD), np.random.default_rng(0))
+
+
+async def test_it_looks_until_it_has_enough() -> None:
+    source, told = Pictures(board_picture(), EMPTY), list[str]()
+    search = BoardSearch(source, "infrared")
+    found = await search.look(BOARD, told.append)
+    assert np.abs(found.T_world_camera - inverse(T_CAMERA_BOARD)).max() < 2e-3
+    assert found.frames_used == GOOD_FRAMES
+    assert told[:2] == ["looking for the board: 12 of 12 markers", "looking for the board: 0 of 12 markers"]
+    assert not source.looking
+    assert search.outcome == ""
+
+
+async def test_a_pose_that_is_not_known_well_takes_more_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("edge_unit.calibration.board_scan.GOOD_MM", 0.0)
+    found = await BoardSearch(Pictures(board_picture()), "infrared").look(BOARD, lambda seen: None)
+    assert found.frames_used == FRAMES
+
+
+async def test_without_a_board_it_looks_ever_less_often() -> None:
+    source = Pictures(EMPTY)
+    search = BoardSearch(source, "infrared")
+    assert search.due(monotonic_ns())
+    with pytest.raises(BoardError, match="none of the board's 12 markers"):
+        await search.look(BOARD, lambda seen: None)
+    assert source.taken == EMPTY_FRAMES - 1
+    after_ns = monotonic_ns()
+    assert not search.due(after_ns)
+    assert search.due(after_ns + round(RETRY_MIN_S * 1e9))
+    with pytest.raises(BoardError):
+        await search.look(BOARD, lambda seen: None)
+    assert not search.due(monotonic_ns() + round(1.5 * RETRY_MIN_S * 1e9))
+    assert "none of the board's" in search.outcome
+    search.begin_anew()
+    assert search.due(0)
+
+
+async def test_a_source_without_pictures() -> None:
+    search = BoardSearch(object(), "infrared")
+    assert not search.due(monotonic_ns())
+    with pytest.raises(BoardError, match="no pictures"):
+        await search.look(BOARD, lambda seen: None)
+    with pytest.raises(SourceError, match="no picture"):
+        await BoardSearch(Pictures(), "infrared").look(BOARD, lambda seen: None)
+
+
+@pytest.mark.parametrize("stream", ["infrared", "color"])
+async def test_a_simulated_camera_finds_its_pose_by_the_demo_cells_board(stream: ImageStream, demo: Cell) -> None:
+    source = SimulatedSource(SimulatedSourceConfig(camera=1, people=0, knows_pose=False))
+    try:
+        camera = await source.open()
+        assert camera.T_world_camera is None
+        assert demo.board is not None
+        found = await BoardSearch(source, stream).look(demo.board, lambda seen: None)
+    finally:
+        await source.close()
+    off = inverse(rig(demo, 4)[1]) @ found.T_world_camera
+    assert np.linalg.norm(off[:3, 3]) < 0.015
+    assert np.degrees(angle_rad(off)) < 0.3
+
+
+def test_what_stands_before_the_board_hides_it() -> None:
+    world = World.demo(people=0)
+    camera = BoardCamera(world, rig(world.cell, 4)[3], "infrared", 0)
+    assert camera.intrinsics.shape == camera.take(0.0).shape
+    board = world.cell.board
+    assert board is not None
+    picture = BoardPicture(BoardLayout.of(board), camera.intrinsics)
+    assert camera._T_image_board is not None
+    clear = picture.expose(camera._T_image_board)
+    hidden = np.abs(camera.take(0.0) - clear) > 40.0
+    # The tray and the arm are before a good part of it, but not before all.
+    board_px = np.abs(clear - clear[0, 0]) > 40.0
+    assert 0.2 < hidden[board_px].mean() < 0.9

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The background of one camera: begun, given up, learned, found again, dropped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_unit.daemon.background_learning import Learning
+from edge_unit.daemon.background_store import BackgroundStore, Place
+from edge_unit.pipeline import DepthPipeline
+from edge_unit.sources import CameraInfo
+from shared.camera import Intrinsics
+from shared.cell import Cell
+from shared.messages import DONE, Command
+from shared.transforms import look_at
+
+CAMERA = Intrinsics(64, 48, 60.0, 60.0, 31.5, 23.5)
+POSE = look_at((0.0, 0.0, 2.0), (0.0, 0.0, 0.0))
+PLACE = Place(CameraInfo("A", "fake", CAMERA), POSE)
+LEARN, DROP = Command(id=1, verb="learn_background"), Command(id=2, verb="drop_background")
+DEPTH = np.full(CAMERA.shape, 1900, np.uint16)
+
+
+class Student:
+    """One unit's learning, and what became of its commands."""
+
+    def __init__(self, folder: Path, frames: int | None = None) -> None:
+        self.told: list[tuple[int, str]] = []
+        self.pipeline = DepthPipeline(CAMERA, POSE, Cell("bare", np.full(3, -1.0), np.full(3, 1.0)))
+        store = BackgroundStore(folder)
+        self.learning = Learning(store, frames, lambda command, outcome: self.told.append((command.id, outcome)))
+
+    def add(self) -> str | None:
+        return self.learning.add(self.pipeline, PLACE, DEPTH, None)
+
+
+def test_what_was_learned_is_found_again_and_stays_dropped(tmp_path: Path) -> None:
+    one = Student(tmp_path, frames=2)
+    one.learning.find(one.pipeline, PLACE)
+    assert one.learning.progress == (0, 2)
+    assert one.add() == "learning the background: frame 1 of 2"
+    assert one.add() is None
+    assert one.learning.progress is None
+    assert one.pipeline.reference is not None
+    again = Student(tmp_path, frames=2)
+    again.learning.find(again.pipeline, PLACE)
+    assert again.learning.progress is None
+    assert again.pipeline.reference is not None
+    again.learning.drop(again.pipeline, DROP)
+    assert again.pipeline.reference is None
+    assert again.told == [(2, DONE)]
+    last = Student(tmp_path)
+    last.learning.find(last.pipeline, PLACE)
+    assert last.pipeline.reference is None
+    assert last.add() is None
+
+
+def test_whoever_asked_is_told_what_became_of_it(tmp_path: Path) -> None:
+    one = Student(tmp_path, frames=1)
+    one.learning.begin(one.pipeline, LEARN)
+    one.learning.begin(one.pipeline, LEARN)
+    assert one.add() is None
+    assert one.told == [(1, "it was asked to begin anew"), (1, DONE)]
+
+
+def test_a_background_that_cannot_be_removed_costs_no_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = Student(tmp_path)
+
+    def refuse(_: BackgroundStore) -> None:
+        raise OSError("read-only file system")
+
+    monkeypatch.setattr(BackgroundStore, "drop", refuse)
+    one.learning.drop(one.pipeline, DROP)
+    assert one.told == [(2, "it is used no more, but comes back with the next start: read-only file system")]

@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the master asked for, by when it is carried out."""
+
+from __future__ import annotations
+
+import asyncio
+
+from edge_unit.daemon.command_batch import Orders, put_back
+from shared.messages import Command
+
+
+async def test_each_command_has_its_time_and_none_is_lost() -> None:
+    refine, image = Command(id=1, verb="refine"), Command(id=2, verb="image", image="depth")
+    calibrate, drop = Command(id=3, verb="calibrate"), Command(id=4, verb="drop_background")
+    queue: asyncio.Queue[Command] = asyncio.Queue()
+    put_back(queue, (refine, image, calibrate, drop))
+    orders = Orders.take(queue)
+    assert orders == Orders([calibrate], [refine, drop], [image])
+    assert queue.empty()
+    put_back(queue, (*orders.changes, *orders.pictures))
+    assert Orders.take(queue) == Orders([], [refine, drop], [image])

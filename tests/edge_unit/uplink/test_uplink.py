@@ -1,0 +1,358 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The exchange against a master that is nothing but its answers."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from edge_unit.pipeline import SeenBlocks
+from edge_unit.sources import CameraInfo
+from edge_unit.uplink import uplink as module
+from edge_unit.uplink.cell_cache import CellCache
+from edge_unit.uplink.client import TIMEOUT, MasterClient
+from edge_unit.uplink.uplink import Delivery, Report, Uplink, seen_report
+from shared.camera import Intrinsics
+from shared.cell import Cell
+from shared.clock import monotonic_ns
+from shared.errors import MasterRefused, MasterUnreachable, WireError
+from shared.lattice import Lattice
+from shared.messages import (
+    MAX_SEEN_BYTES,
+    CellReference,
+    Command,
+    InitializeAnswer,
+    InitializeRequest,
+    JointSample,
+    LatticeDescription,
+    RobotAnswer,
+    UpdateAnswer,
+    UpdateRequest,
+    Versions,
+    matrix_of,
+)
+from shared.settings import Settings
+from shared.transforms import from_xyz_rpy
+from shared.wire import unpack_seen
+
+CAMERA = CameraInfo("A", "model", Intrinsics(8, 6, 10.0, 10.0, 4.0, 3.0))
+POSE = from_xyz_rpy((1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
+CELL = Cell("cell", np.zeros(3), np.ones(3))
+LATTICE = CELL.lattice(0.05)
+CLOCK_AHEAD_NS = 5 * 10**12
+
+
+@dataclass
+class FakeMaster:
+    """Answers in turn with `answers`: an error, what an answer should contain, or nothing in particular."""
+
+    versions: Versions = field(default_factory=lambda: Versions(settings=1, lattice=1, cell=1, pose=1))
+    knows_pose: bool = True
+    answers: list[Exception | dict[str, Any]] = field(default_factory=list)
+    registrations: list[InitializeRequest] = field(default_factory=list)
+    updates: list[UpdateRequest] = field(default_factory=list)
+    poses: list[tuple[int, str]] = field(default_factory=list)
+    joints: tuple[JointSample, ...] = ()
+    refuse: Exception | None = None
+    gate: asyncio.Event | None = None
+    url: str = "http://fake"
+
+    async def authorize(self) -> None:
+        """Anyone may."""
+
+    async def initialize(self, request: InitializeRequest) -> InitializeAnswer:
+        if self.refuse is not None:
+            raise self.refuse
+        self.registrations.append(request)
+        now_ns = monotonic_ns() + CLOCK_AHEAD_NS
+        return InitializeAnswer(
+            id=7,
+            session=100 + len(self.registrations),
+            versions=self.versions,
+            settings=Settings(),
+            lattice=LatticeDescription.of(LATTICE),
+            cell=CellReference(name="cell", sha256=CELL.version),
+            T_world_camera=matrix_of(POSE) if self.knows_pose else None,
+            received_at_ns=now_ns,
+            answered_at_ns=now_ns,
+        )
+
+    async def update(self, update: UpdateRequest) -> UpdateAnswer:
+        self.updates.append(update)
+        if self.gate is not None:
+            await self.gate.wait()
+        answer = self.answers.pop(0) if self.answers else {}
+        if isinstance(answer, Exception):
+            raise answer
+        now_ns = monotonic_ns() + CLOCK_AHEAD_NS
+        fields = {"versions": self.versions, "received_at_ns": now_ns, "answered_at_ns": now_ns, **answer}
+        return UpdateAnswer(**fields)
+
+    async def robot(self, since_ns: int, timeout_s: float) -> RobotAnswer:
+        if self.refuse is not None:
+            raise self.refuse
+        samples = tuple(sample for sample in self.joints if sample.at_ns > since_ns)
+        return RobotAnswer(state="fresh", joint_names=("a",), now_ns=monotonic_ns(), joints=samples)
+
+    async def put_pose(self, unit_id: int, T_world_camera: Any, origin: str) -> int:
+        self.poses.append((unit_id, origin))
+        return 9
+
+
+class OneCell:
+    async def get(self, reference: CellReference, client: Any) -> Cell:
+        return CELL
+
+
+class Bench:
+    def __init__(self, **fields: Any) -> None:
+        self.master = FakeMaster(**fields)
+        self.sent: list[tuple[Report, Delivery | None]] = []
+        self.uplink = Uplink(
+            cast(MasterClient, self.master),
+            cast(CellCache, OneCell()),
+            "software",
+            "boot",
+            lambda report, delivery: self.sent.append((report, delivery)),
+        )
+
+    def report(self, number: int = 0, seen: SeenBlocks | None = None) -> Report:
+        assert self.uplink.assignment is not None
+        return Report(self.uplink.assignment, monotonic_ns(), bytes((number, 0, 0, 0)), seen)
+
+    def keys(self) -> list[int]:
+        return [update.keys[0] if update.keys else -1 for update in self.master.updates]
+
+
+async def until(look: Callable[[], Any]) -> None:
+    deadline_ns = monotonic_ns() + 5 * 10**9
+    while not look():
+        assert monotonic_ns() < deadline_ns
+        await asyncio.sleep(0.001)
+
+
+@contextlib.asynccontextmanager
+async def running(**fields: Any) -> AsyncIterator[Bench]:
+    """An uplink that has registered."""
+    bench = Bench(**fields)
+    task = asyncio.create_task(bench.uplink.run())
+    bench.uplink.set_camera(CAMERA, None)
+    try:
+        if bench.master.refuse is None:
+            await asyncio.wait_for(bench.uplink.assigned.wait(), 5.0)
+        yield bench
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+async def test_it_registers_and_reports() -> None:
+    async with running() as bench:
+        report = bench.report(1)
+        bench.uplink.offer(report)
+        await bench.uplink.drained(5.0)
+        update = next(update for update in bench.master.updates if update.keys)
+        assert (update.id, update.session) == (7, 101)
+        assert update.captured_at_ns == report.captured_at_ns
+        assert update.versions == bench.master.versions
+        assert update.exchange is not None
+        assert update.exchange.offset_ns == pytest.approx(CLOCK_AHEAD_NS, abs=10**8)
+        sent, delivery = bench.sent[0]
+        assert sent is report
+        assert delivery is not None
+        # By the unit's clock, although the master's is far ahead.
+        assert all(abs(at_ns - monotonic_ns()) < 10**9 for at_ns in delivery)
+    assert bench.master.registrations[0].serial == "A"
+
+
+async def test_the_latest_report_wins() -> None:
+    gate = asyncio.Event()
+    async with running(gate=gate) as bench:
+        bench.uplink.offer(bench.report(1))
+        await until(lambda: bench.keys()[-1:] == [1])
+        for number in (2, 3, 4):
+            bench.uplink.offer(bench.report(number))
+        gate.set()
+        await bench.uplink.drained(5.0)
+        assert bench.keys()[-2:] == [1, 4]
+        assert [merged is not None for _, merged in bench.sent] == [False, False, True, True]
+
+
+async def test_sequences_rise_and_the_last_report_is_repeated_while_nothing_new_comes() -> None:
+    async with running() as bench:
+        bench.uplink.offer(bench.report(1))
+        await until(lambda: bench.keys().count(1) >= 3)
+        sequences = [update.sequence for update in bench.master.updates]
+        assert sequences == sorted(set(sequences))
+        repeated = [update for update in bench.master.updates if update.keys]
+        assert len({update.captured_at_ns for update in repeated}) == 1
+        assert len(bench.sent) == 1
+
+
+@pytest.mark.parametrize("status", [401, 403, 404, 409])
+async def test_a_master_that_does_not_know_it_any_more_is_asked_again(status: int) -> None:
+    async with running() as bench:
+        bench.master.answers = [MasterRefused("gone", status)]
+        bench.uplink.offer(bench.report(1))
+        await until(lambda: len(bench.master.registrations) == 2 and bench.uplink.assignment is not None)
+        before = len(bench.master.updates)
+        await until(lambda: len(bench.master.updates) > before)
+        # What was made for the session before is not told to the new one.
+        assert {(update.session, update.keys) for update in bench.master.updates[before:]} == {(102, b"")}
+        bench.uplink.offer(bench.report(2))
+        await until(lambda: bench.keys()[-1] == 2)
+
+
+@pytest.mark.parametrize("error", [MasterUnreachable("nobody"), MasterRefused("busy", 503), WireError("nonsense")])
+async def test_other_trouble_is_waited_out_in_the_same_session(error: Exception) -> None:
+    async with running() as bench:
+        bench.master.answers = [error, error]
+        bench.uplink.offer(bench.report(1))
+        await bench.uplink.drained(5.0)
+        assert bench.keys()[-3:] == [1, 1, 1]
+        assert [merged is not None for _, merged in bench.sent] == [True]
+        assert len(bench.master.registrations) == 1
+
+
+async def test_it_keeps_asking_a_master_that_is_not_there() -> None:
+    async with running(refuse=MasterUnreachable("nobody")) as bench:
+        await asyncio.sleep(0.2)
+        assert bench.uplink.assignment is None
+        bench.master.refuse = None
+        await asyncio.wait_for(bench.uplink.assigned.wait(), 2.0 * module.RETRY_MAX_S)
+
+
+@pytest.mark.parametrize("knows_pose", [False, True])
+async def test_a_known_pose_is_told_and_what_the_master_answers_counts(knows_pose: bool) -> None:
+    bench = Bench(knows_pose=knows_pose)
+    told = from_xyz_rpy((0.0, 0.0, 0.5), (0.0, 0.0, 0.0))
+    task = asyncio.create_task(bench.uplink.run())
+    bench.uplink.set_camera(CAMERA, (told, "source"))
+    await asyncio.wait_for(bench.uplink.assigned.wait(), 5.0)
+    task.cancel()
+    assert bench.master.registrations[0].T_world_camera == matrix_of(told)
+    assert bench.master.registrations[0].pose_origin == "source"
+    assert bench.uplink.assignment is not None
+    pose = bench.uplink.assignment.T_world_camera
+    assert np.array_equal(pose, POSE) if knows_pose else pose is None
+
+
+async def test_what_the_master_changes_is_a_new_assignment() -> None:
+    async with running() as bench:
+        first = bench.uplink.assignment
+        assert first is not None
+        moved = from_xyz_rpy((0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+        bench.master.versions = Versions(settings=2, lattice=2, cell=1, pose=2)
+        changes = {
+            "settings": Settings(voxel_size_m=0.1),
+            "lattice": LatticeDescription.of(CELL.lattice(0.1)),
+            "T_world_camera": matrix_of(moved),
+        }
+        bench.master.answers = [changes]
+        await until(lambda: bench.uplink.assignment is not first)
+        second = bench.uplink.assignment
+        assert second is not None
+        assert second.versions == bench.master.versions
+        assert second.lattice.voxel_size_m == second.settings.voxel_size_m == 0.1
+        assert second.T_world_camera is not None
+        assert np.array_equal(second.T_world_camera, moved)
+        assert second.cell is first.cell
+        assert second.session == first.session
+        # And a pose that is void.
+        bench.master.versions = bench.master.versions.model_copy(update={"pose": 3})
+        await until(lambda: bench.uplink.assignment is not second)
+        assert bench.uplink.assignment is not None
+        assert bench.uplink.assignment.T_world_camera is None
+
+
+async def test_another_camera_ends_the_session_even_while_an_answer_is_under_way() -> None:
+    gate = asyncio.Event()
+    async with running(gate=gate) as bench:
+        await until(lambda: bench.master.updates)
+        bench.uplink.set_camera(CameraInfo("B", "model", CAMERA.intrinsics), None)
+        bench.master.versions = Versions(settings=2, lattice=1, cell=1, pose=1)
+        gate.set()
+        await until(lambda: len(bench.master.registrations) == 2 and bench.uplink.assignment is not None)
+        assert bench.master.registrations[1].serial == "B"
+        assert bench.uplink.assignment is not None
+        assert bench.uplink.assignment.session == 102
+
+
+async def test_commands_are_carried_out_once_and_told_until_the_master_knows() -> None:
+    async with running() as bench:
+        command = Command(id=5, verb="learn_background")
+        bench.master.answers = [{"commands": (command,)}] * 3
+        await until(lambda: not bench.master.answers)
+        assert bench.uplink.commands.get_nowait() == command
+        assert bench.uplink.commands.empty()
+        bench.master.answers = [MasterUnreachable("nobody")]
+        bench.uplink.finish(command, "no board in view")
+        before = len(bench.master.updates)
+        await until(
+            lambda: (
+                len([update for update in bench.master.updates[before:] if update.done == ((5, "no board in view"),)])
+                >= 2
+            )
+        )
+        await until(lambda: bench.master.updates[-1].done == ())
+
+
+async def test_joints_that_are_missing_are_asked_for() -> None:
+    async with running() as bench:
+        now_ns = monotonic_ns()
+        bench.master.joints = (JointSample(now_ns, (0.5,), None),)
+        await bench.uplink.refresh_joints(now_ns)
+        assert bench.uplink.joints.newest_ns == now_ns
+        bench.master.refuse = MasterUnreachable("nobody")
+        await bench.uplink.refresh_joints(now_ns + 1)
+        assert bench.uplink.joints.newest_ns == now_ns
+
+
+async def test_what_is_seen_is_told_when_it_changes_and_until_it_is_known() -> None:
+    lattice = Lattice((0.0, 0.0, 0.0), 0.1, (4, 4, 4))
+    one = SeenBlocks(np.ones(64, np.uint8), lattice)
+    other = SeenBlocks(np.zeros(64, np.uint8), lattice)
+    async with running() as bench:
+        for number, (seen, told) in enumerate(((one, True), (one, False), (other, True), (other, False)), 1):
+            bench.uplink.offer(bench.report(number, seen))
+            await until(lambda number=number: bench.keys()[-1:] == [number])
+            await bench.uplink.drained(5.0)
+            first = next(update for update in bench.master.updates if update.keys[:1] == bytes((number,)))
+            assert (first.seen is not None) == told
+        bench.master.answers = [MasterUnreachable("nobody")]
+        bench.uplink.offer(bench.report(5, one))
+        await until(lambda: len([u for u in bench.master.updates if u.keys[:1] == b"\5" and u.seen]) == 2)
+
+
+async def test_trouble_goes_along_with_every_report() -> None:
+    async with running() as bench:
+        bench.uplink.trouble = "camera: unplugged"
+        await until(lambda: bench.master.updates and bench.master.updates[-1].health.trouble == "camera: unplugged")
+        bench.uplink.trouble = None
+        await until(lambda: bench.master.updates[-1].health.trouble is None)
+
+
+def test_what_would_be_too_long_is_told_in_larger_blocks() -> None:
+    shape = (50, 50, 40)
+    noise = np.random.default_rng(1).random(shape) < 0.95
+    report = seen_report(SeenBlocks(noise.astype(np.uint8).reshape(-1), Lattice((0.0, 0.0, 0.0), 0.1, shape)))
+    assert len(report.bits) <= MAX_SEEN_BYTES
+    assert report.shape == (25, 25, 20)
+    assert report.block_size_m == pytest.approx(0.2)
+    coarse = unpack_seen(report)
+    for index in np.argwhere(coarse)[:100]:
+        low = 2 * index
+        assert noise[tuple(slice(a, a + 2) for a in low)].all()
+
+
+def test_a_cut_that_heals_at_the_worst_moment_costs_less_than_a_second() -> None:
+    assert TIMEOUT.connect is not None
+    # A connection asked for just before, the longest pause behind it, and a fifth of a second to register and report.
+    assert TIMEOUT.connect + 1.2 * module.RETRY_MAX_S + 0.2 <= 1.0

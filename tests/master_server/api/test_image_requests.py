@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures are asked of a unit when someone wants one, and of no unit otherwise."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import httpx
+import pytest
+
+from master_server.api import image_requests as module
+from master_server.api.image_requests import PNG_SIGNATURE
+from master_server.app import make_app
+from master_server.security import Access
+from shared.messages import MAX_IMAGE_BYTES, Command, Outcome
+from shared.wire import decode_update_answer
+from tests.master_server.fakes import FakeUnit, master
+from tests.master_server.test_app import OPERATOR, UNIT, Desk
+
+PICTURE = PNG_SIGNATURE + b"picture"
+
+
+@pytest.fixture
+def desk() -> Desk:
+    return Desk(make_app(master(), Access(UNIT.encode(), OPERATOR.encode())))
+
+
+async def asked(desk: Desk, unit: FakeUnit, path: str, callers: int = 1) -> tuple[list[Any], tuple[Command, ...]]:
+    """Callers that wait for a picture, and what the unit is told to do."""
+    waiting = [asyncio.ensure_future(desk.call("GET", path)) for _ in range(callers)]
+    while not unit.master.registry.get(unit.initialized.id).commands:
+        await asyncio.sleep(0.001)
+    commands = decode_update_answer((await desk.update(unit)).content).commands
+    return waiting, commands
+
+
+async def put(desk: Desk, path: str, command: int, png: bytes = PICTURE, ip: str = "10.0.0.1") -> httpx.Response:
+    return await desk.call("PUT", f"{path}?command={command}", UNIT, ip, content=png)
+
+
+@pytest.mark.parametrize("raw", [False, True])
+async def test_all_who_ask_share_one_picture(desk: Desk, raw: bool) -> None:
+    unit = await desk.register()
+    waiting, commands = await asked(desk, unit, f"/units/1/images/foreground?raw={raw:d}", callers=3)
+    assert [(command.verb, command.image, command.raw) for command in commands] == [("image", "foreground", raw)]
+    assert (await put(desk, "/units/1/images/foreground", commands[0].id)).status_code == 204
+    for response in await asyncio.gather(*waiting):
+        assert (response.status_code, response.content) == (200, PICTURE)
+        assert response.headers["content-type"] == "image/png"
+        assert response.headers.get("x-depth-range-m") == (None if raw else "0.3 6")
+    # Nothing is kept, and it is no command of an operator's.
+    assert (await put(desk, "/units/1/images/foreground", commands[0].id)).status_code == 409
+    assert (await desk.call("GET", "/units")).json()[0]["last_command"] is None
+    await desk.update(unit, done=(Outcome(commands[0].id, "done"),))
+    assert decode_update_answer((await desk.update(unit)).content).commands == ()
+
+
+async def test_a_picture_that_does_not_come_is_not_waited_for(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    await desk.register()
+    monkeypatch.setattr(module, "IMAGE_EXPIRES_S", 0.05)
+    response = await desk.call("GET", "/units/1/images/depth")
+    assert response.status_code == 504
+    assert response.json()["detail"] == "unit 1: its picture did not come within 0.05 s, see GET /units"
+    assert not desk.app.state.pictures._awaited
+
+
+async def test_why_there_is_no_picture_is_told(desk: Desk) -> None:
+    unit = await desk.register()
+    (waiting,), (command,) = await asked(desk, unit, "/units/1/images/expected")
+    await desk.update(unit, done=(Outcome(command.id, "the pose of its camera is not known yet"),))
+    response = await waiting
+    assert response.status_code == 409
+    assert response.json()["detail"] == "unit 1: no picture: the pose of its camera is not known yet"
+
+
+async def test_nobody_sends_what_was_not_asked_for(desk: Desk) -> None:
+    unit = await desk.register()
+    await desk.register("10.0.0.2", "B")
+    path = "/units/1/images/depth"
+    assert (await put(desk, path, 1)).status_code == 409
+    (waiting,), (command,) = await asked(desk, unit, path)
+    assert (await put(desk, path, command.id, ip="10.0.0.2")).status_code == 403
+    assert (await put(desk, path, command.id + 1)).status_code == 409
+    assert (await put(desk, path, command.id, b"<svg>")).status_code == 422
+    assert (await put(desk, path, command.id, b"\0" * (MAX_IMAGE_BYTES + 1))).status_code == 413
+    assert not waiting.done()
+    assert (await put(desk, path, command.id)).status_code == 204
+    assert (await waiting).content == PICTURE
+
+
+async def test_unknown_pictures(desk: Desk) -> None:
+    assert (await desk.call("GET", "/units/1/images/depth")).status_code == 404
+    await desk.register()
+    assert (await desk.call("GET", "/units/1/images/colour")).status_code == 422

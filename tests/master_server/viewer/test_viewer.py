@@ -1,0 +1,325 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The operator's window without a browser: who is let in, what is passed on, what is drawn."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import AsyncIterator
+from http.cookies import Morsel, SimpleCookie
+from types import SimpleNamespace
+from typing import Any
+
+import httpx
+import msgpack
+import numpy as np
+import pytest
+
+from master_server.api.history import SAMPLES_MAX, History, Sample
+from master_server.app import add_viewer, make_app
+from master_server.core import Master
+from master_server.security import Access, Role
+from master_server.viewer.panel import contact_sheet, lattice_of, legend_html, status_html, table_html
+from master_server.viewer.proxy import LOGIN_PAGE, Gate, is_passed, link_path
+from master_server.viewer.scene import (
+    SHARED_COLOUR,
+    UNIT_COLOURS,
+    WITNESS_COLOURS,
+    cube,
+    linear,
+    surface,
+    unit_colour,
+    view_edges,
+)
+from master_server.viewer.sessions import LINK_S, LINKS_MAX, SESSION_S, Sessions, Viewer
+from master_server.viewer.snapshot import Wanted, look
+from master_server.viewer.window import voxels_of
+from shared.camera import Intrinsics
+from shared.errors import Refusal
+from shared.lattice import Lattice
+from tests.master_server.fakes import START_NS, S, joined, master, sees_all
+
+UNIT, OPERATOR = b"u" * 32, b"o" * 32
+WALL_NS = 1_800_000_000 * S
+
+
+@pytest.fixture
+async def served() -> AsyncIterator[SimpleNamespace]:
+    app = make_app(master(), Access(UNIT, OPERATOR))
+    gate = add_viewer(app, {})
+    async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://master:8420") as client:
+        yield SimpleNamespace(gate=gate, client=client)
+    assert isinstance(gate, Gate)
+    assert not gate.host.is_running
+
+
+def morsel(response: httpx.Response) -> Morsel[str]:
+    (found,) = SimpleCookie(response.headers["set-cookie"]).values()
+    return found
+
+
+async def test_without_a_token_there_is_only_the_way_in(served: SimpleNamespace) -> None:
+    answer = await served.client.get("/viewer/")
+    assert answer.status_code == 401
+    assert answer.text == LOGIN_PAGE
+    assert "script-src 'sha256-" in answer.headers["content-security-policy"]
+    assert (await served.client.get("/viewer/login")).text == LOGIN_PAGE
+    assert not re.search(r"(?:src|href)=.?http", LOGIN_PAGE)
+
+
+@pytest.mark.parametrize(("token", "viewer"), [(UNIT, Viewer.READER), (OPERATOR, Viewer.OPERATOR)])
+async def test_a_token_is_exchanged_for_a_cookie(served: SimpleNamespace, token: bytes, viewer: Viewer) -> None:
+    answer = await served.client.post("/viewer/login", json={"token": token.decode()})
+    assert answer.status_code == 204
+    cookie = morsel(answer)
+    assert cookie.key == "cellwatch-viewer-8420"
+    assert (cookie["httponly"], cookie["samesite"], cookie["path"]) == (True, "strict", "/viewer")
+    assert token.decode() not in answer.headers["set-cookie"]
+    page = await served.client.get("/viewer/")
+    assert page.status_code == 200
+    assert "<title>Cellwatch</title>" in page.text
+    assert "connect-src 'self'" in page.headers["content-security-policy"]
+    assert served.gate.sessions.viewer(cookie.value, 1) is viewer
+
+
+@pytest.mark.parametrize("body", [{"token": "x" * 32}, {"code": "x"}, {"code": ""}, {"token": "\ud800é"}])
+async def test_what_is_wrong_opens_nothing(served: SimpleNamespace, body: dict[str, str]) -> None:
+    answer = await served.client.post(
+        "/viewer/login", content=json.dumps(body), headers={"Content-Type": "application/json"}
+    )
+    assert answer.status_code in (401, 422)
+    assert "set-cookie" not in answer.headers
+
+
+async def test_neither_does_nothing_at_all(served: SimpleNamespace) -> None:
+    answer = await served.client.post("/viewer/login", json={})
+    assert (answer.status_code, answer.json()["detail"]) == (422, "body: expected a code or a token, got neither")
+
+
+async def test_guesses_are_slowed_down(served: SimpleNamespace) -> None:
+    codes = [(await served.client.post("/viewer/login", json={"code": f"guess{i}"})).status_code for i in range(30)]
+    assert codes[0] == 401
+    assert codes[-1] == 429
+
+
+async def test_a_link_works_once(served: SimpleNamespace) -> None:
+    refused = await served.client.post("/viewer/links", headers={"Authorization": f"Bearer {UNIT.decode()}"})
+    assert refused.status_code == 403
+    made = await served.client.post("/viewer/links", headers={"Authorization": f"Bearer {OPERATOR.decode()}"})
+    path, _, code = made.json()["path"].partition("#")
+    assert path == "/viewer/login"
+    assert (await served.client.post("/viewer/login", json={"code": code})).status_code == 204
+    again = await served.client.post("/viewer/login", json={"code": code})
+    assert (again.status_code, "set-cookie" in again.headers) == (401, False)
+
+
+async def test_another_page_cannot_log_anyone_in(served: SimpleNamespace) -> None:
+    code = link_path(served.gate.sessions).partition("#")[2]
+    answer = await served.client.post("/viewer/login", json={"code": code}, headers={"Origin": "http://evil"})
+    assert answer.status_code == 403
+    own = await served.client.post("/viewer/login", json={"code": code}, headers={"Origin": "http://master:8420"})
+    assert own.status_code == 204
+
+
+def test_a_link_grows_old() -> None:
+    sessions = Sessions(Access(UNIT, OPERATOR))
+    code = sessions.make_code(START_NS)
+    with pytest.raises(Refusal, match="not opened yet"):
+        sessions.redeem(code, START_NS + LINK_S * S)
+    codes = [sessions.make_code(START_NS) for _ in range(LINKS_MAX + 1)]
+    with pytest.raises(Refusal):
+        sessions.redeem(codes[0], START_NS)
+    assert sessions.redeem(codes[1], START_NS + LINK_S * S - 1) is Viewer.OPERATOR
+
+
+def test_a_link_is_void_with_the_token_under_which_it_was_made() -> None:
+    access = Access(UNIT, OPERATOR)
+    sessions = Sessions(access)
+    code = sessions.make_code(START_NS)
+    access.replace(Role.OPERATOR, b"another-token-0123456789")
+    with pytest.raises(Refusal, match="not opened yet"):
+        sessions.redeem(code, START_NS)
+
+
+def test_a_cookie_is_worth_as_much_as_the_token_behind_it() -> None:
+    sessions = Sessions(Access(UNIT, OPERATOR))
+    for viewer in Viewer:
+        cookie = sessions.cookie(viewer, WALL_NS)
+        assert Sessions(Access(UNIT, OPERATOR)).viewer(cookie, WALL_NS + (SESSION_S - 1) * S) is viewer
+        assert sessions.viewer(cookie, WALL_NS + SESSION_S * S) is None
+        assert Sessions(Access(b"n" * 32, b"m" * 32)).viewer(cookie, WALL_NS) is None
+    raised = sessions.cookie(Viewer.READER, WALL_NS).replace("reader", "operator")
+    assert sessions.viewer(raised, WALL_NS) is None
+    name, expires, signature = sessions.cookie(Viewer.READER, WALL_NS).split(".")
+    later = f"{name}.{int(expires) + 1}.{signature}"
+    for wrong in ("", "..", later, f"{name}.٣.{signature}", f"{name}.{'9' * 40}.{signature}", "operator.1.", "é.1.2"):
+        assert sessions.viewer(wrong, WALL_NS) is None
+
+
+@pytest.mark.parametrize(
+    ("message", "passed"),
+    [
+        ({"type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0]}, True),
+        ({"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": 0.03}}, True),
+        ({"type": "GuiUpdateMessage", "uuid": "a", "updates": {"update_cb": []}}, False),
+        ({"type": "GuiUpdateMessage", "uuid": "a", "updates": ["value"]}, False),
+        ({"type": "ShareUrlRequest"}, False),
+        ({"type": "ShareUrlDisconnect"}, False),
+        ({"type": "FileTransferStartUpload"}, False),
+        ({"type": ["ViewerCameraMessage"]}, False),
+        ({}, False),
+        ([], False),
+    ],
+)
+def test_only_what_a_person_does_is_passed_on(message: Any, passed: bool) -> None:
+    assert is_passed(msgpack.packb(message)) is passed
+
+
+@pytest.mark.parametrize("data", [b"", b"\xc1", b"\x81", b"\x91" * 3000, b"\x81\xff"])
+def test_noise_is_not_passed_on(data: bytes) -> None:
+    assert not is_passed(data)
+
+
+def test_a_look_tells_what_is_drawn() -> None:
+    watched = master()
+    history = History(watched)
+    history.take(START_NS - S)
+    history.take(START_NS)
+    told = told_of(watched, history, Wanted(units=True, unseen=True, since_ns=START_NS - S))
+    assert [Sample(*values) for values in told["history"]] == [Sample(START_NS, None, 0, 0, False)]
+    assert lattice_of(told["lattice"]) == watched.lattice
+    blocks = lattice_of(told["blocks"])
+    assert len(told["seen"]) == -(-blocks.cell_count // 8)
+    assert told["reasons"] == ["there is no unit"]
+    assert told["robot"]["state"] == "none"
+    assert "The map is not complete" in status_html(told)
+    assert "No unit has registered yet" in table_html(told["units"])
+    assert not {"units", "history", "reports", "seen"} & told_of(watched, history, Wanted()).keys()
+
+
+def told_of(watched: Master, history: History, wanted: Wanted, now_ns: int = START_NS) -> dict[str, Any]:
+    """A look as it comes out of the channel."""
+    told: dict[str, Any] = msgpack.unpackb(msgpack.packb(look(watched, history, wanted, now_ns)), strict_map_key=False)
+    return told
+
+
+def test_colours_tell_how_many_or_who() -> None:
+    watched = master()
+    for number, keys in ((1, [3, 4]), (2, [4, 5])):
+        joined(watched, number).update(START_NS, keys, seen=sees_all(watched))
+    history = History(watched)
+    voxels = voxels_of(told_of(watched, history, Wanted(reports=True)))
+    assert voxels.owners.tolist() == [1, 0, 2]
+    assert voxels.colours(by_unit=False).tolist() == linear([WITNESS_COLOURS[i] for i in (0, 1, 0)]).tolist()
+    expected = linear([unit_colour(1), SHARED_COLOUR, unit_colour(2)])
+    assert voxels.colours(by_unit=True).tolist() == expected.tolist()
+    # Nobody asked who reports them.
+    assert voxels_of(told_of(watched, history, Wanted())).owners.tolist() == [0, 0, 0]
+
+
+def test_what_is_linear_is_shown_as_meant() -> None:
+    assert linear([(0, 0, 0), (255, 128, 10)]).tolist() == [[0, 0, 0], [255, 55, 1]]
+
+
+def test_every_colour_of_a_unit_is_another() -> None:
+    colours = np.array([*UNIT_COLOURS, SHARED_COLOUR], int)
+    apart = np.abs(colours[:, None] - colours[None]).sum(axis=2) + 999 * np.eye(len(colours), dtype=int)
+    assert apart.min() > 100
+    assert unit_colour(len(UNIT_COLOURS) + 1) == unit_colour(1)
+
+
+def test_a_legend_names_what_is_drawn() -> None:
+    rows = [{"id": 1}, {"id": 4}]
+    assert [text in legend_html(False, rows, True) for text in ("1 unit<", "2 units<", "3 or more<", "unit 4")] == [
+        True, True, True, False,
+    ]  # fmt: skip
+    by_unit = legend_html(True, rows, True)
+    assert all(f"rgb{unit_colour(row['id'])}" in by_unit and f"unit {row['id']}<" in by_unit for row in rows)
+    assert "several units" in by_unit
+    assert "not recorded" in legend_html(True, rows, False)
+
+
+def test_a_view_is_that_of_its_own_camera() -> None:
+    wide, narrow = Intrinsics(640, 480, 320.0, 320.0, 319.5, 239.5), Intrinsics(848, 480, 848.0, 848.0, 400.0, 239.5)
+    for camera in (wide, narrow):
+        edges = view_edges(camera, 2.0)
+        assert edges.shape == (8, 2, 3)
+        np.testing.assert_array_equal(edges[:4, 0], 0.0)
+        pixels = camera.project(edges[:4, 1].astype(np.float64))
+        right, bottom = camera.width - 0.5, camera.height - 0.5
+        np.testing.assert_allclose(pixels, [(-0.5, -0.5), (right, -0.5), (right, bottom), (-0.5, bottom)], atol=1e-3)
+        assert (edges[:4, 1, 2] == 2.0).all()
+
+
+def test_who_learns_shows_how_far_it_is() -> None:
+    row = {
+        "id": 1, "ip": "10.0.0.1", "state": "blind", "reason": "learning the background: frame 12 of 60", "age_s": 0.1,
+        "fps": 15.0, "process_ms": 5.0, "voxels": 0, "last_command": None,
+        "health": {"valid_share": 0.9, "agreeing_share": 0.0, "static_share": 0.0},
+    }  # fmt: skip
+    assert '<progress value="12" max="60"></progress>' in table_html([row])
+    assert "<progress" not in table_html([row | {"reason": "frame 12 of 60"}])
+
+
+async def test_the_last_minutes_are_there_for_who_asks() -> None:
+    watched = master()
+    app = make_app(watched, Access(UNIT, OPERATOR))
+    joined(watched, 1).update(START_NS, [3], seen=sees_all(watched))
+    for number in range(SAMPLES_MAX + 5):
+        app.state.history.take(START_NS + number * S // 1000)
+    async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://master:8420") as client:
+        assert (await client.get("/history")).status_code == 401
+        answer = await client.get("/history", headers={"Authorization": f"Bearer {UNIT.decode()}"})
+    told = answer.json()
+    assert len(told["at_ns"]) == len(told["voxels"]) == SAMPLES_MAX
+    assert told["at_ns"][0] == START_NS + 5 * S // 1000
+    assert (told["voxels"][0], told["units_live"][0], told["complete"][0]) == (1, 1, True)
+    assert told["oldest_view_age_s"][0] == pytest.approx(0.035, abs=2e-3)
+
+
+def test_what_a_unit_says_of_itself_is_no_markup() -> None:
+    row = {
+        "id": 1,
+        "ip": "<b>",
+        "state": "stale",
+        "reason": "<script>alert(1)</script>",
+        "age_s": None,
+        "fps": 0.0,
+        "process_ms": 0.0,
+        "voxels": 0,
+        "health": {"valid_share": 0.0, "agreeing_share": 0.0, "static_share": 0.0},
+        "last_command": {"verb": "refine", "outcome": "<i>"},
+    }
+    shown = table_html([row])
+    assert 'data-unit="1" data-state="stale"' in shown
+    assert "&lt;script&gt;" in shown
+    assert not re.search("<(?:script|i)>", shown)
+
+
+def test_the_surface_of_a_block_closes_around_it() -> None:
+    lattice = Lattice((1.0, 2.0, 3.0), 0.5, (3, 3, 3))
+    inside = np.zeros((3, 3, 3), np.bool_)
+    inside[1, 1, 1] = True
+    vertices, faces = surface(inside, lattice)
+    assert faces.shape == (12, 3)
+    np.testing.assert_allclose(vertices.min(0), (1.5, 2.5, 3.5))
+    np.testing.assert_allclose(vertices.max(0), (2.0, 3.0, 4.0))
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    np.testing.assert_allclose(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0, 6 * 0.25)
+    inside[1, 1, 2] = True
+    assert len(surface(inside, lattice)[1]) == 20
+    assert len(surface(np.zeros_like(inside), lattice)[1]) == 0
+
+
+def test_the_faces_of_a_voxel_look_outwards() -> None:
+    vertices, faces = cube(2.0)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), a + b + c) > 0).all()
+    assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0 == pytest.approx(24.0)
+
+
+def test_three_pictures_are_one() -> None:
+    first, second, third = (np.full((2, 3, 3), value, np.uint8) for value in (1, 2, 3))
+    sheet = contact_sheet([first, second, third])
+    assert sheet.shape == (4, 6, 3)
+    assert (sheet[0, 0, 0], sheet[0, 5, 0], sheet[3, 0, 0], sheet[3, 5, 0]) == (1, 2, 3, 0)

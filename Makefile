@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-accuracy bench-pipeline bench-board bench-master bench-scale bench-latency soak bench-stance bench-paper viewer-test rehearsal image-test pictures test lint clean libusb
+.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-accuracy bench-pipeline bench-board bench-master bench-scale bench-latency soak bench-pose-monitor bench-paper viewer-test rehearsal image-test pictures test lint clean libusb
 
 ARGS ?=
 MINUTES ?= 30
@@ -69,7 +69,7 @@ soak: $(READY) ## all sorts of faults at once for MINUTES (30): no answer wrong,
 bench-board: $(READY) ## how well a camera's pose is found by a calibration board, by distance
 	@$(BIN)/python -m benchmarks.board $(ARGS)
 
-bench-stance: $(READY) ## how soon a knocked or covered camera is told, and how often one is wrongly suspected
+bench-pose-monitor: $(READY) ## how soon a knocked or covered camera is told, and how often one is wrongly suspected
 	@$(BIN)/python -m benchmarks.pose_monitor $(ARGS)
 
 bench-paper: $(BENCH_READY) libusb ## the paper's experiment: one to four cameras, distributed against centralised and OctoMap

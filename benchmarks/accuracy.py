@@ -3,8 +3,8 @@
 
 Ours, the paper's own rule and a least number of points a voxel, on the same frames of a D435i whose every pixel is a
 ray cast by Embree, as curves over distance, size, voxels and thresholds; then on real frames. Prints tables, and leaves
-all of it in `results/accuracy.json`: its `curves` explain themselves, its `remarks` say where ours is the worse. Exits
-with 1 when a mark is missed.
+all of it in `out/results/accuracy.json`: its `curves` explain themselves, its `remarks` say where ours is the worse.
+Exits with 1 when a mark is missed.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 
 Simulated pictures of 1280x720: perspective, antialiased, blur of 0.6 px, noise of 2 grey values in 255. Boards are
 tilted by 10 to 45 degrees and stand anywhere in the middle third of the picture. The frames of a view differ by their
-noise only. Prints a table, and all of it as one line of JSON; a whole run leaves that in `results/board.json`. Exits
-with 1 when a mark is missed.
+noise only. Prints a table, and all of it as one line of JSON; a whole run leaves that in `out/results/board.json`.
+Exits with 1 when a mark is missed.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make bench-stance`: how soon a knocked or covered camera is told, and how often one that hangs still is suspected.
+"""`make bench-pose-monitor`: how soon a knocked or covered camera is told, and how often a still one is suspected.
 
 Cameras of the demo cell with a D435i's faults, people who walk and reach before them, the robot moving. A false alarm
 is a look at which a camera that nobody touched is called moved or blind.
@@ -155,7 +155,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "seconds_to_notice_max": max((row[3] for row in rows), default=float("nan")),
         "passed": all(mark.met for mark in marks),
     }
-    write("stance", document, options.results)
+    write("pose_monitor", document, options.results)
     print(line(document))
     return 0 if document["passed"] else 1
 
@@ -176,12 +176,14 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="make bench-stance", description="Knocked, covered, and untouched cameras.")
+    parser = argparse.ArgumentParser(
+        prog="make bench-pose-monitor", description="Knocked, covered, and untouched cameras."
+    )
     parser.add_argument("--hours", type=float, default=0.1, help="of each of the four cameras, untouched (0.1)")
     parser.add_argument("--trials", type=int, default=4, help="of each knock, camera and number of people (4)")
     parser.add_argument("--resolution", type=_size, default=(424, 240), metavar="WxH", help="(424x240)")
     parser.add_argument("--processes", type=int, default=2, help="at once (2)")
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for stance.json")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for pose_monitor.json")
     return parser
 
 

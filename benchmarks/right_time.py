@@ -5,7 +5,7 @@ A UR3e whose tool moves at 1 m/s, on sinusoids and with sharp reversals, under a
 10 cm in no model stands 15 cm beside the arm in every frame, on either side by turns. Rays are cast by Embree, with the
 camera's faults on them. Its joints reach the master late, in many ways, and the unit from there by the very code that
 runs; a frame arrives `FRAME_LATENCY_S` after its capture. Prints a table for each question, and all of it as one line
-of JSON; a whole run leaves that in `results/right_time.json`. Exits with 1 when a mark is missed.
+of JSON; a whole run leaves that in `out/results/right_time.json`. Exits with 1 when a mark is missed.
 """
 
 from __future__ import annotations

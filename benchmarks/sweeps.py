@@ -2,7 +2,7 @@
 """`make sweeps`: what the filter sees and does not see at its default settings, before cameras with a D435i's faults.
 
 Rays are cast by Embree, so that no bug of the filter's own rasterizer can hide in both. Prints a table for each
-question, and all of it as one line of JSON at the end; a whole run leaves that in `results/sweeps.json`, too. Exits
+question, and all of it as one line of JSON at the end; a whole run leaves that in `out/results/sweeps.json`, too. Exits
 with 1 when a mark is missed.
 """
 

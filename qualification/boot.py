@@ -386,7 +386,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(starts, faults, sep="\n")
     document["tables"] = [starts.document(), faults.document()]
     if not options.names and not options.no_results:
-        write("rehearsal", document)
+        write("boot", document)
     print(line(document))
     return 0 if all(mark.met for mark in found) else 1
 
@@ -396,7 +396,7 @@ def _parser() -> argparse.ArgumentParser:
     names = [fault.name for fault in FAULTS]
     parser.add_argument("names", nargs="*", choices=[*names, []], metavar="NAME", help=", ".join(names))
     parser.add_argument("--roots", type=Path, default=ROOTS, help="root file systems (default: out/rehearsal)")
-    parser.add_argument("--no-results", action="store_true", help="leave benchmarks/results as it is")
+    parser.add_argument("--no-results", action="store_true", help="leave out/results as it is")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     return parser
 

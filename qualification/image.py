@@ -208,7 +208,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     result = result_of(document)
     print(result)
     if not options.no_results:
-        write("image_test", document | {"table": result.document()})
+        write("image", document | {"table": result.document()})
     print(line(document))
     return 0 if all(mark.met for mark in result.marks) else 1
 
@@ -238,7 +238,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--cache", type=Path, default=CACHE, help=f"compiled kernels (default: {CACHE})")
     parser.add_argument("--no-build", action="store_true", help="boot the image that is there")
     parser.add_argument("--wait-s", type=float, default=WAIT_S, help=f"for the boards to report (default {WAIT_S:g})")
-    parser.add_argument("--no-results", action="store_true", help="leave benchmarks/results as it is")
+    parser.add_argument("--no-results", action="store_true", help="leave out/results as it is")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     return parser
 

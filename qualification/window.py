@@ -89,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=OUT, metavar="DIR", help=f"for pictures ({OUT})")
     parser.add_argument("--seconds", type=float, default=SECONDS, help=f"of each measurement ({SECONDS:g})")
     parser.add_argument("--turns", type=int, default=TURNS, help=f"of the measurement ({TURNS})")
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for viewer.json")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for window.json")
     options = parser.parse_args(arguments)
     before = os.getloadavg()[0]
     found = run_tests(options.out)
@@ -115,7 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ),
     ]
     print("\n".join(map(str, marks)))
-    write("viewer", found | {"marks": [mark.document() for mark in marks]}, options.results)
+    write("window", found | {"marks": [mark.document() for mark in marks]}, options.results)
     print(line(found))
     return 0 if all(mark.met for mark in marks) else 1
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ from benchmarks.reporting.plots import draw
 
 FOLDER = Path(__file__).resolve().parents[1]
 REPORT = FOLDER / "REPORT.md"
+BASELINE = FOLDER / "baseline"
+"""The results that `REPORT.md` shows, kept with the source."""
 
 ROWS_OPEN_MAX = 24
 """A longer table is folded away: who wants all of it opens it."""
@@ -26,16 +28,19 @@ INTRODUCTION = """\
 # What was measured
 
 Each figure was taken by the command that is named beside it, of the source whose commit is named, too. `make bench`
-measures anew what fits into some 20 minutes on two cores with nothing else to do, and writes this page; the other
-commands run by themselves, and the page shows what they left last. Times on shared machines are noisy: contenders take
-turns within one run, medians count, and what is claimed is a ratio within one run wherever it can be. Nothing here was
-measured on a Jetson or before a live camera.
+measures anew what fits into some 20 minutes on two cores with nothing else to do, the other commands run by themselves;
+`make bench ARGS="--page-only --keep"` keeps what they left last as the baseline that this page shows. Times on shared
+machines are noisy: contenders take turns within one run, medians count, and what is claimed is a ratio within one run
+wherever it can be. Nothing here was measured on a Jetson or before a live camera.
 """
 
 
-def write_page(results: Path, report: Path = REPORT) -> list[dict[str, Any]]:
-    """Write `report` from what lies in `results`, plots beside it in `plots/`; returns all marks found."""
-    found = {part.name: document for part in PARTS if (document := _read(results / f"{part.name}.json")) is not None}
+def write_page(results: Sequence[Path], report: Path = REPORT) -> list[dict[str, Any]]:
+    """Write `report`, plots beside it in `plots/`; returns all marks found.
+
+    Each part's result is taken from the first of the folders `results` that has one.
+    """
+    found = {part.name: document for part in PARTS if (document := _read(results, f"{part.name}.json")) is not None}
     marks = [mark | {"part": name} for name, document in found.items() for mark in marks_in(document)]
     lines = [INTRODUCTION, *_overview(found), *_missed(found), "# Results in full", ""]
     for part in PARTS:
@@ -156,8 +161,9 @@ def _nodes(document: Any) -> Iterator[dict[str, Any]]:
             yield from _nodes(value)
 
 
-def _read(path: Path) -> dict[str, Any] | None:
-    if not path.exists():
+def _read(folders: Sequence[Path], name: str) -> dict[str, Any] | None:
+    path = next((folder / name for folder in folders if (folder / name).exists()), None)
+    if path is None:
         return None
     document: dict[str, Any] = json.loads(path.read_text())
     return document

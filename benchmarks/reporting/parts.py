@@ -8,9 +8,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Part:
-    """One module of this package that leaves `results/NAME.json`."""
+    """One module that leaves `out/results/NAME.json`."""
 
     name: str
+    """Of the module, too."""
+
     target: str
     """Of `make`, by which it runs alone."""
 
@@ -22,13 +24,12 @@ class Part:
     arguments: tuple[str, ...] = ()
     """With which `make bench` runs it."""
 
-    module: str | None = None
-    """Where it is not called like its result."""
+    package: str = "benchmarks"
 
     @property
     def runs(self) -> str:
         """The module, for `python -m`."""
-        return f"benchmarks.{self.module or self.name}"
+        return f"{self.package}.{self.name}"
 
 
 PARTS = (
@@ -77,14 +78,57 @@ PARTS = (
     Part("sweeps", "sweeps", "Thin, small and silent things", "How thin may a thing be, how still is a still cell?"),
     Part("right_time", "right-time", "The robot where it was", "What do late, jittering or rare joints cost?"),
     Part("board", "bench-board", "Pose by a printed board", "How exactly is a camera's pose found?"),
-    Part("stance", "bench-stance", "Knocked and covered cameras", "How soon is it told, and how often wrongly?"),
+    Part(
+        "pose_monitor",
+        "bench-pose-monitor",
+        "Knocked and covered cameras",
+        "How soon is it told, and how often wrongly?",
+    ),
     Part("master", "bench-master", "The master at its limit", "How many updates a second, beside a bare web service?"),
-    Part("faults", "faults", "Things that fail", "What does the map say meanwhile, and how soon is it right again?"),
-    Part("soak", "soak", "All of them at once", "For as long as is wished: is any answer wrong, does anything grow?"),
-    Part("source_faults", "source-faults", "Cameras that fail", "How soon is it told, and when do frames flow again?"),
-    Part("plug_and_play", "plug-and-play", "Power on and forget", "How long until units that know nothing are live?"),
-    Part("rehearsal", "rehearsal", "Machines that boot", "How long from power-on to the first voxel?"),
-    Part("image_test", "image-test", "One image, two arm64 boards", "Do they boot, differ and report, and how soon?"),
-    Part("viewer", "viewer-test", "The operator's window", "What do those who look cost the units?"),
+    Part(
+        "faults",
+        "faults",
+        "Things that fail",
+        "What does the map say meanwhile, and how soon is it right again?",
+        package="qualification",
+    ),
+    Part(
+        "soak",
+        "soak",
+        "All of them at once",
+        "For as long as is wished: is any answer wrong, does anything grow?",
+        package="qualification",
+    ),
+    Part(
+        "source_faults",
+        "source-faults",
+        "Cameras that fail",
+        "How soon is it told, and when do frames flow again?",
+        package="qualification",
+    ),
+    Part(
+        "plug_and_play",
+        "plug-and-play",
+        "Power on and forget",
+        "How long until units that know nothing are live?",
+        package="qualification",
+    ),
+    Part(
+        "boot", "rehearsal", "Machines that boot", "How long from power-on to the first voxel?", package="qualification"
+    ),
+    Part(
+        "image",
+        "image-test",
+        "One image, two arm64 boards",
+        "Do they boot, differ and report, and how soon?",
+        package="qualification",
+    ),
+    Part(
+        "window",
+        "viewer-test",
+        "The operator's window",
+        "What do those who look cost the units?",
+        package="qualification",
+    ),
 )
 """In the order of the report. Those with a limit are what `make bench` runs."""

@@ -13,7 +13,8 @@ from typing import Any
 
 from benchmarks.reporting.circumstances import circumstances
 
-RESULTS = Path(__file__).resolve().parents[1] / "results"
+RESULTS = Path(__file__).resolve().parents[2] / "out" / "results"
+"""What each run rewrites; no part of the source."""
 
 NUMBERS = re.compile(r"\[\s+((?:(?:-?\d[\d.e+-]*|null),?\s+)+)\]")
 """A list of nothing but numbers, as `json` breaks it into lines."""

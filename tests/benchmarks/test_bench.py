@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.bench import run
+from benchmarks.bench import keep, run
 from benchmarks.reporting.parts import PARTS, Part
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -54,3 +54,15 @@ def test_a_part_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_each_part_is_a_module_and_a_target_of_make(each: Part) -> None:
     assert importlib.util.find_spec(each.runs) is not None
     assert re.search(rf"^{each.target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+
+
+def test_only_what_was_measured_becomes_the_baseline(tmp_path: Path) -> None:
+    results, baseline = tmp_path / "results", tmp_path / "baseline"
+    results.mkdir()
+    baseline.mkdir()
+    (results / "real.json").write_text("new")
+    (results / "something_else.json").write_text("new")
+    for name in ("real.json", "sweeps.json"):
+        (baseline / name).write_text("old")
+    assert keep(results, baseline) == ["real"]
+    assert {file.name: file.read_text() for file in baseline.iterdir()} == {"real.json": "new", "sweeps.json": "old"}

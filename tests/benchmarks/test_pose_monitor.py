@@ -42,4 +42,4 @@ def test_what_is_not_told_is_late_and_misses_the_mark(
     assert missed == {"shifted by 20 mm: % not told within 2 s", "false alarms, looks"}
     assert document["false_alarm_looks"] == 2
     assert np.isclose(document["camera_hours"], 8 * 100 * PERIOD_S / 3600)
-    assert json.loads((tmp_path / "stance.json").read_text())["passed"] is False
+    assert json.loads((tmp_path / "pose_monitor.json").read_text())["passed"] is False

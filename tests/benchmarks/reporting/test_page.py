@@ -28,12 +28,12 @@ def results(tmp_path: Path) -> Path:
 
 
 def page(results: Path) -> str:
-    write_page(results, results.parent / "REPORT.md")
+    write_page((results,), results.parent / "REPORT.md")
     return (results.parent / "REPORT.md").read_text()
 
 
 def test_all_marks_are_found_however_deep_they_lie(results: Path) -> None:
-    marks = write_page(results, results.parent / "REPORT.md")
+    marks = write_page((results,), results.parent / "REPORT.md")
     assert [(mark["part"], mark["name"], mark["met"]) for mark in marks] == [
         ("pipeline", MISSED.name, False),
         ("real", MET.name, True),
@@ -53,6 +53,12 @@ def test_what_was_not_measured_is_told(results: Path) -> None:
     assert absent
     for part in absent:
         assert f"Not measured yet: `make {part.target}`." in text
+
+
+def test_a_result_of_today_stands_before_the_baseline(results: Path, tmp_path: Path) -> None:
+    write("real", {"marks": [MET.document() | {"value": 0.2}]}, tmp_path / "today")
+    marks = write_page((tmp_path / "today", results), tmp_path / "REPORT.md")
+    assert [(mark["part"], mark["value"]) for mark in marks] == [("pipeline", MISSED.value), ("real", 0.2)]
 
 
 def test_tables_are_whole_and_long_ones_folded(results: Path) -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edge_unit.config import ENVIRONMENT_PREFIX, UnitConfig
-from edge_unit.sources import DepthSource
+from edge_unit.sources.frame import DepthSource
 from edge_unit.sources.recorded import RecordedSourceConfig
 from edge_unit.sources.simulated import SimulatedSource, SimulatedSourceConfig
 from geometry.compilation.cache import settle, settle_for

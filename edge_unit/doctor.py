@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from edge_unit.config import UnitConfig
 from edge_unit.monitoring import clock_is_set, usb_cameras
-from edge_unit.sources import CameraInfo, DepthFrame, DepthSource
+from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
 from edge_unit.sources.realsense import capture_link as link
 from edge_unit.sources.realsense.capture_session import CaptureSession
 from edge_unit.sources.realsense.source import RealsenseSource, RealsenseSourceConfig

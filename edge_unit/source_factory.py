@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from edge_unit.config import SourceConfig
-from edge_unit.sources import DepthSource
+from edge_unit.sources.frame import DepthSource
 from edge_unit.sources.realsense.source import RealsenseSource, RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
 from edge_unit.sources.simulated import SimulatedSource

@@ -26,10 +26,10 @@ import numpy as np
 import yaml
 
 from benchmarks.reporting.report import Mark, Result, line, write
-from edge_unit.sources import SourceStatus
 from edge_unit.sources.realsense.bag_writer import record_images
 from edge_unit.sources.realsense.source import RealsenseSource, RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSourceConfig
+from edge_unit.sources.status import SourceStatus
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, SourceError
 from shared.waiting import within

@@ -14,6 +14,7 @@ import pytest
 from blockbuster import BlockBuster
 from hypothesis import settings
 
+from qualification.machines.containers import why_not
 from tests.missing import missing
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -49,6 +50,17 @@ def data_dir() -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CELLWATCH_DATA", str(folder))
         yield folder
+
+
+@pytest.fixture(scope="session")
+def roots() -> Path:
+    """Root file systems of a unit and a master, which `.ci/run` has made before the tests, for these fetch nothing."""
+    if (reason := why_not()) is not None:
+        pytest.skip(f"no machines can be run here: {reason}")
+    folder = Path(os.environ.get("CELLWATCH_ROOTS", CHECKOUT / "out" / "rehearsal"))
+    if not (folder / "master" / "opt").exists():
+        pytest.skip("there are no root file systems: `deploy/image/rehearsal-roots out/rehearsal` makes them")
+    return folder
 
 
 def _threads() -> set[threading.Thread]:

@@ -25,6 +25,14 @@ WALLS = {  # package: the packages that it imports, and no others of the project
 KERNELS = ("geometry", "kernels")
 KERNEL_IMPORTS = {"__future__", "collections", "math", "numba", "numpy", "typing"}
 CLOCK = ("shared", "clock")
+MODULES_MAX = 16
+"""In a folder; more are rooms that nobody has named yet."""
+LARGE = {("shared",), KERNELS}
+"""Folders that may hold more: what both sides agree on is one list, and so is the arithmetic."""
+BEFORE_SETTLED = (("geometry",), ("geometry", "compilation"))
+"""Imported before the folder of compiled kernels is settled: whatever they re-exported would be defined too early."""
+MIRRORED = PACKAGES
+"""Packages whose tests lie in folders of the same names."""
 WALL_CLOCK_CALLS = {"now", "utcnow", "today"}
 LISTED = re.compile(r"^ {4}(\w+/?) +\S", re.MULTILINE)
 # In brackets, so that this page does not find itself.
@@ -100,6 +108,41 @@ def check_packages(root: Path) -> Iterator[str]:
                 yield f"{file.relative_to(root)}:{line}: {module[0]} imports {target[0]}"
 
 
+def check_size(root: Path) -> Iterator[str]:
+    """No folder holds more modules than a reader can keep in mind."""
+    folders: dict[Module, int] = {}
+    for file, module in modules(root):
+        if file.name != "__init__.py":
+            folders[module[:-1]] = folders.get(module[:-1], 0) + 1
+    for folder, count in sorted(folders.items()):
+        if count > MODULES_MAX and folder not in LARGE:
+            yield f"{'/'.join(folder)}: {count} modules, at most {MODULES_MAX}"
+
+
+def check_re_exports(root: Path) -> Iterator[str]:
+    """A page re-exports what its own room has; no module takes from its room's page what lies beside it."""
+    for file, module in modules(root):
+        room = module if file.name == "__init__.py" else module[:-1]
+        for line, target in imports(file, module):
+            where = f"{file.relative_to(root)}:{line}"
+            if file.name == "__init__.py":
+                if target[0] in PACKAGES and target[: len(room)] != room:
+                    yield f"{where}: re-exports {'.'.join(target)}, which is of another room"
+                elif room in BEFORE_SETTLED and target[-1] != "settle":
+                    yield f"{where}: re-exports {target[-1]} before the kernels' folder is settled"
+            elif target[:-1] == room and target[-1] not in {name.rstrip("/") for name in listing(file.parent)}:
+                yield f"{where}: imports {target[-1]} from the page of its own room"
+
+
+def check_mirror(root: Path) -> Iterator[str]:
+    """Tests lie in folders that are called like those that they test."""
+    for package in MIRRORED:
+        for folder in sorted({file.parent for file in (root / "tests" / package).rglob("test_*.py")}):
+            tested = root / folder.relative_to(root / "tests")
+            if not (tested / "__init__.py").is_file():
+                yield f"{folder.relative_to(root)}: there is no {tested.relative_to(root)}"
+
+
 def check_kernels(root: Path) -> Iterator[str]:
     """Kernels are pure functions on arrays: no I/O, no clock, no configuration."""
     for file, module in modules(root):
@@ -136,7 +179,17 @@ def check_machine(root: Path) -> Iterator[str]:
                 yield f"{file.relative_to(root)}:{number}: names {found.group()}"
 
 
-CHECKS: tuple[Check, ...] = (check_listings, check_order, check_packages, check_kernels, check_clock, check_machine)
+CHECKS: tuple[Check, ...] = (
+    check_listings,
+    check_order,
+    check_packages,
+    check_size,
+    check_re_exports,
+    check_mirror,
+    check_kernels,
+    check_clock,
+    check_machine,
+)
 
 
 @pytest.mark.parametrize("check", CHECKS)
@@ -153,7 +206,8 @@ BAD = {
     "shared/__init__.py": '"""Shared.\n\n    clock  time\n    cell   box\n    ghost  gone\n    clock  again\n"""',
     "shared/clock.py": "import time\nfrom . import cell",
     "shared/cell.py": "import edge_unit.config\nfrom shared.clock import now\nfrom datetime import datetime as d",
-    "geometry/__init__.py": '"""Geometry.\n\n    config    what\n    kernels/  how\n    drawing   all\n"""',
+    "geometry/__init__.py": '"""Geometry.\n\n    config        what\n    compilation/  where\n'
+    + '    kernels/      how\n    drawing       all\n"""',
     "geometry/config.py": "def f():\n    from geometry.kernels import project\n    from time import sleep",
     "geometry/kernels/__init__.py": '"""Kernels.\n\n    project  rays\n    density  sums\n"""',
     "geometry/kernels/project.py": "import numpy as np, math\nfrom geometry.kernels import density\nimport os.path",
@@ -164,6 +218,19 @@ BAD = {
     "edge_unit/loose/part.py": "",
     "simulation/__init__.py": '"""Simulation."""',
     "simulation/world.py": "import edge_unit.pipeline",
+    "master_server/__init__.py": '"""Master.\n\n'
+    + "".join(f"    m{n}  one\n" for n in range(17))
+    + '    page/  room\n"""',
+    **{f"master_server/m{n}.py": "" for n in range(17)},
+    "master_server/page/__init__.py": '"""Page.\n\n    one  one\n    two  two\n"""\n'
+    + "from master_server.page.one import name\nfrom master_server.m1 import other",
+    "master_server/page/one.py": "name = 1",
+    "master_server/page/two.py": "from master_server.page import name\nfrom master_server.page import one",
+    "geometry/compilation/__init__.py": '"""Compiled.\n\n    cache  folder\n"""\n'
+    + "from geometry.compilation.cache import settle, other",
+    "geometry/compilation/cache.py": "",
+    "tests/master_server/page/test_one.py": "",
+    "tests/master_server/gone/test_two.py": "",
     "notes.md": "fine: ~/x, $HOME/x, a/ro" + "ot/b\nlies in /" + "home/anna/x\nfrom py" + "pi.org",
 }
 EXPECTED: dict[Check, list[str]] = {
@@ -184,6 +251,13 @@ EXPECTED: dict[Check, list[str]] = {
         "shared/cell.py:1: shared imports edge_unit",
         "edge_unit/pipeline.py:2: edge_unit imports master_server",
     ],
+    check_size: ["master_server: 17 modules, at most 16"],
+    check_re_exports: [
+        "geometry/compilation/__init__.py:5: re-exports other before the kernels' folder is settled",
+        "master_server/page/__init__.py:7: re-exports master_server.m1.other, which is of another room",
+        "master_server/page/two.py:1: imports name from the page of its own room",
+    ],
+    check_mirror: ["tests/master_server/gone: there is no master_server/gone"],
     check_kernels: [
         "geometry/kernels/density.py:3: a kernel imports geometry.drawing.run",
         "geometry/kernels/project.py:3: a kernel imports os.path",

@@ -19,7 +19,7 @@ import edge_unit.source_factory
 from benchmarks.latency_probe.frames import RING_HZ, camera_phase_s
 from edge_unit.__main__ import main
 from edge_unit.config import SourceConfig
-from edge_unit.sources import CameraInfo, DepthFrame, DepthSource
+from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import SourceError

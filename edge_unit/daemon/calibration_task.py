@@ -8,7 +8,7 @@ import logging
 from edge_unit.calibration.board_layout import require_board
 from edge_unit.calibration.board_scan import BoardSearch
 from edge_unit.daemon.report import troubled
-from edge_unit.sources import DepthFrame
+from edge_unit.sources.frame import DepthFrame
 from edge_unit.uplink.uplink import Assignment, Uplink
 from shared.errors import CellwatchError
 from shared.messages import DONE, PoseQuality

@@ -14,7 +14,7 @@ from edge_unit.daemon.report import health_of, troubled, within_bounds
 from edge_unit.joints import JointEstimate
 from edge_unit.monitoring import Stages, Stance
 from edge_unit.pipeline import DepthPipeline
-from edge_unit.sources import DepthFrame
+from edge_unit.sources.frame import DepthFrame
 from edge_unit.uplink.uplink import Assignment, Report
 from shared.errors import InputError
 from shared.messages import Command

@@ -14,7 +14,7 @@ from edge_unit.daemon.pipeline_manager import AssignedPipeline
 from edge_unit.daemon.task_group import Errands
 from edge_unit.joints import JointEstimate
 from edge_unit.pipeline import picture_raw, png_of
-from edge_unit.sources import DepthFrame
+from edge_unit.sources.frame import DepthFrame
 from edge_unit.uplink.uplink import Uplink
 from shared.errors import CellwatchError, InputError
 from shared.messages import Command, ImageKind

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from edge_unit.monitoring import Verdict
 from edge_unit.pipeline import DepthPipeline, SeenBlocks, Voxels
-from edge_unit.sources import DepthFrame
+from edge_unit.sources.frame import DepthFrame
 from edge_unit.uplink.uplink import Assignment, Report
 from shared.clock import NS_PER_MS
 from shared.messages import MAX_TEXT, MAX_VOXELS, Health

@@ -29,7 +29,8 @@ from edge_unit.daemon.task_group import Errands
 from edge_unit.daemon.warm_up import rehearse
 from edge_unit.monitoring import CameraStanding, Progress, Stages, Stance, Trace, boot_id
 from edge_unit.source_factory import is_recording
-from edge_unit.sources import DepthFrame, DepthSource, ReportsStatus
+from edge_unit.sources.frame import DepthFrame, DepthSource
+from edge_unit.sources.status import ReportsStatus
 from edge_unit.uplink.cell_cache import CellCache
 from edge_unit.uplink.client import MasterClient
 from edge_unit.uplink.master_discovery import MasterSearch

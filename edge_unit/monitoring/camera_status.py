@@ -8,7 +8,8 @@ import logging
 
 from edge_unit.config import UnitConfig
 from edge_unit.monitoring.last_camera import CameraMemory
-from edge_unit.sources import CameraInfo, ReportsStatus
+from edge_unit.sources.frame import CameraInfo
+from edge_unit.sources.status import ReportsStatus
 from edge_unit.uplink.uplink import Uplink
 from shared.errors import SourceError
 from shared.messages import MAX_TEXT, ToldOrigin

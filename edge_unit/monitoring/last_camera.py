@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from edge_unit.sources import CameraInfo
+from edge_unit.sources.frame import CameraInfo
 from shared.camera import Intrinsics
 from shared.files import StateFile
 

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 from edge_unit.joints import JointHistory
 from edge_unit.pipeline import SeenBlocks
-from edge_unit.sources import CameraInfo
+from edge_unit.sources.frame import CameraInfo
 from edge_unit.uplink.cell_cache import CellCache
 from edge_unit.uplink.client import MasterClient
 from edge_unit.uplink.master_discovery import MasterSearch

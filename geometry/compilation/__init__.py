@@ -3,6 +3,7 @@
 
 In the order of the flow:
 
+    kernel_state the state of the kernels' source, which names the folder of what is compiled from it
     prebuilt  compiled kernels that a release brings, for a named processor
     cache     the folder of compiled kernels, one for each state of their source
 """

@@ -14,7 +14,6 @@ So files that are empty or cut short are taken out, and compiled anew.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import pickletools
@@ -26,6 +25,7 @@ from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 
+from geometry.compilation.kernel_state import state_of_kernels
 from geometry.compilation.prebuilt import PREFIX, Target, carried, link
 from shared.errors import JitCacheError
 
@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 
 VARIABLES = ("CELLWATCH_JIT_CACHE", "NUMBA_CACHE_DIR")
 
-KERNELS = Path(__file__).parents[1] / "kernels"
+KERNELS = Path(__file__).resolve().parents[1] / "kernels"
 
 STATES_MAX = 3
 """States of the kernels that are kept: this one, and what one may go back to."""
@@ -49,7 +49,7 @@ def settle(directory: Path | str | None = None) -> Path:
     else in a private temporary folder, with a warning. Returns the folder of the kernels as they are.
 
     Raises:
-        JitCacheError: not even a temporary folder can be made.
+        JitCacheError: not even a temporary folder can be made, or the kernels' source is not found.
     """
     wanted = next((Path(name) for name in (directory, *map(os.environ.get, VARIABLES)) if name), None)
     if wanted is not None and wanted.name.startswith(PREFIX):
@@ -74,9 +74,9 @@ def settle_for(target: Target, directory: Path) -> Path:
     """Have all kernels compiled for `target`, to be carried by a release, into a folder below `directory`.
 
     Raises:
-        JitCacheError: it cannot be written.
+        JitCacheError: it cannot be written, or the kernels' source is not found.
     """
-    folder = directory / target.name / f"{PREFIX}{_state_of_kernels()}"
+    folder = directory / target.name / f"{PREFIX}{_state()}"
     if not _writable(folder):
         raise JitCacheError(f"{folder} cannot be written")
     target.choose()
@@ -85,7 +85,7 @@ def settle_for(target: Target, directory: Path) -> Path:
 
 
 def _use(parent: Path) -> Path:
-    state = _state_of_kernels()
+    state = _state()
     folder = parent / f"{PREFIX}{state}"
     found = carried(state)
     if found is not None:
@@ -139,12 +139,11 @@ def _tell_numba(folder: Path) -> None:
         numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]  # numba sets its options from outside
 
 
-def _state_of_kernels() -> str:
-    """Changes whenever any kernel does."""
-    digest = hashlib.sha256()
-    for file in sorted(KERNELS.glob("*.py")):
-        digest.update(file.read_bytes())
-    return digest.hexdigest()[:12]
+def _state() -> str:
+    try:
+        return state_of_kernels()
+    except OSError as error:
+        raise JitCacheError(f"compiled kernels cannot be told apart: {error}") from error
 
 
 def _numba_choices() -> list[Path]:

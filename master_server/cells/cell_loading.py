@@ -28,6 +28,9 @@ MAX_ZIP_BYTES = 128 * 2**20
 LOAD_TIMEOUT_S = 60.0
 """Ten times what the largest cell takes; then something is wrong with its files."""
 
+PLACE = Path(unpacking.__file__).resolve().parents[unpacking.__name__.count(".")]
+"""The folder of our packages: the process that unpacks a cell stands elsewhere, where nothing is installed."""
+
 
 class CellLoader:
     """Reads cells that an operator sends."""
@@ -70,7 +73,7 @@ class CellLoader:
             stdout=asyncio.subprocess.PIPE,
             # Where nothing lies that could be imported in place of what is meant.
             cwd=folder,
-            env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "OPENBLAS_NUM_THREADS": "1"},
+            env={**os.environ, "PYTHONPATH": str(PLACE), "OPENBLAS_NUM_THREADS": "1"},
         )
         said = bytearray()
 

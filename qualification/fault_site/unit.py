@@ -16,7 +16,7 @@ import numpy as np
 import edge_unit.source_factory
 from edge_unit.__main__ import main
 from edge_unit.config import SourceConfig
-from edge_unit.sources import DepthFrame, DepthSource
+from edge_unit.sources.frame import DepthFrame, DepthSource
 from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
 from qualification.fault_site.scene import FPS, IMAGE
 from shared.clock import NS_PER_S, monotonic_ns

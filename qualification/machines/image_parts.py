@@ -16,6 +16,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from geometry.compilation import kernel_state
 from qualification.networks import run
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import ConfigError
@@ -35,14 +36,8 @@ CACHED_MAX = 3
 PYTHON = "3.11"
 """That of Debian 12."""
 
-KERNEL_FILES = (
-    "geometry/kernels/*.py",
-    "geometry/compilation/prebuilt.py",
-    "edge_unit/daemon/warm_up.py",
-    "simulation/cameras/raster.py",
-    "simulation/cameras/depth_noise.py",
-)
-"""What decides what is compiled, and for which processor."""
+COMPILED_BY = ("geometry/compilation/prebuilt.py", "edge_unit/daemon/warm_up.py")
+"""Files that decide which kernels are compiled, and for which processor."""
 
 COMPILERS = ("llvmlite", "numba", "numpy")
 
@@ -74,13 +69,12 @@ def why_not_built() -> str | None:
     return f"missing: apt-get install {' '.join(missing)}" if missing else None
 
 
-def state_of_kernels(checkout: Path, lock: Iterable[str]) -> str:
+def state_to_compile(checkout: Path, lock: Iterable[str]) -> str:
     """Changes whenever other kernels are to be compiled; `lock` are lines as `numba==0.68.1 --hash=...`."""
-    digest = hashlib.sha256(PYTHON.encode())
-    for pattern in KERNEL_FILES:
-        for file in sorted(checkout.glob(pattern)):
-            digest.update(f"{file.relative_to(checkout)}\0".encode())
-            digest.update(file.read_bytes())
+    digest = hashlib.sha256(f"{PYTHON} {kernel_state.state_of_kernels(checkout)}".encode())
+    for name in COMPILED_BY:
+        digest.update(f"{name}\0".encode())
+        digest.update((checkout / name).read_bytes())
     for requirement in sorted(lock):
         if requirement.split("==")[0] in COMPILERS:
             digest.update(f"{requirement.strip()}\n".encode())
@@ -113,7 +107,7 @@ def build(parts: Path, cache: Path) -> dict[str, Any]:
     configuration.write_text(CONFIGURATION)
     options = ("--python", PYTHON, "--arch", "aarch64", "--extras", "edge,sim", "--out", wheels)
     step("wheels", DEPLOY / "wheelhouse", *options)
-    kernels = cache / state_of_kernels(CHECKOUT, (wheels / "lock.txt").read_text().splitlines())
+    kernels = cache / state_to_compile(CHECKOUT, (wheels / "lock.txt").read_text().splitlines())
     cached = kernels.is_dir()
     if cached:
         print(f"  kernels: those of an earlier run, in {kernels}", flush=True)

@@ -13,7 +13,7 @@ from collections.abc import AsyncGenerator
 import edge_unit.source_factory
 from edge_unit.__main__ import main
 from edge_unit.config import SourceConfig
-from edge_unit.sources import CameraInfo, DepthFrame, DepthSource
+from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
 from edge_unit.sources.recorded import RecordedSourceConfig
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from qualification.fault_site.scene import FPS

@@ -11,12 +11,16 @@ import re
 import shutil
 import struct
 import subprocess
+import tempfile
 import zipfile
 from pathlib import Path
 
 import pytest
 
-IMAGE = Path(__file__).parents[2] / "deploy" / "image"
+from geometry.compilation.kernel_state import FOLDERS, state_of_kernels
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+IMAGE = CHECKOUT / "deploy" / "image"
 SCRIPTS = sorted(path for path in IMAGE.iterdir() if path.is_file())
 LOCKS = sorted((IMAGE / "locks").glob("*.txt"))
 
@@ -93,7 +97,7 @@ class Bench:
         info = "cellwatch-0.1.0.dist-info"
         files = {
             "edge_unit/__init__.py": "",
-            "edge_unit/kernels/__init__.py": KERNELS,
+            **self.sources(KERNELS),
             f"{info}/METADATA": "Metadata-Version: 2.1\nName: cellwatch\nVersion: 0.1.0\n",
             f"{info}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
         }
@@ -112,9 +116,22 @@ class Bench:
         command = [str(IMAGE / "customize-rootfs"), str(self.root), "--wheelhouse", str(self.wheels), *options]
         return subprocess.run(command, capture_output=True, text=True, check=False)
 
+    def sources(self, kernels: str) -> dict[str, str]:
+        """Files of a release whose kernels are `kernels`."""
+        state = "geometry/compilation/kernel_state.py"
+        return {state: (CHECKOUT / state).read_text()} | {f"{folder}/some.py": kernels for folder in FOLDERS}
+
+    def state(self, kernels: str) -> str:
+        """The state of a release whose kernels are `kernels`."""
+        with tempfile.TemporaryDirectory(dir=self.folder) as place:
+            for name, text in self.sources(kernels).items():
+                (Path(place) / name).parent.mkdir(parents=True, exist_ok=True)
+                (Path(place) / name).write_text(text)
+            return state_of_kernels(Path(place))
+
     def compile_kernels(self, source: str, python: str = "py312") -> str:
         """What `edge-unit compile-kernels` leaves, for kernels of this source."""
-        state = hashlib.sha256(source.encode()).hexdigest()[:12]
+        state = self.state(source)
         kernels = self.folder / f"compiled-{state}-{python}"
         place = kernels / "armv8.2-a" / f"kernels-{state}" / "kernels_0123"
         place.mkdir(parents=True)
@@ -236,7 +253,7 @@ def test_what_is_missing_or_contradicts_itself_is_named(tmp_path: Path) -> None:
 @needs_root
 def test_kernels_are_carried_in_the_release_that_they_fit_and_kept_for_the_next_image(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    state = hashlib.sha256().hexdigest()[:12]
+    state = bench.state(KERNELS)
     kernel = tmp_path / "kernels" / "armv8.2-a" / f"kernels-{state}" / "kernels_0" / "voxelize.py312.1.nbc"
     kernel.parent.mkdir(parents=True)
     kernel.write_text("compiled")

@@ -14,7 +14,7 @@ from edge_unit import __main__ as command_line
 from edge_unit import doctor
 from edge_unit.config import UnitConfig
 from edge_unit.doctor import Finding, Measured, examine
-from edge_unit.sources import CameraInfo
+from edge_unit.sources.frame import CameraInfo
 from edge_unit.sources.realsense.source import RealsenseSourceConfig
 from shared.camera import Intrinsics
 from shared.clock import NS_PER_S

@@ -60,8 +60,8 @@ def test_a_line_of_json_tells_who_and_what(configured: Configure) -> None:
 
 def test_a_line_of_text_is_for_people(configured: Configure) -> None:
     written = configured("text")
-    logging.getLogger("master_server.x").info("unit %d: it works", 3, extra={"event": "e", "unit_id": 3})
-    assert written.getvalue().endswith(" INFO master_server.x: unit 3: it works\n")
+    logging.getLogger("master_server.logs").info("unit %d: it works", 3, extra={"event": "e", "unit_id": 3})
+    assert written.getvalue().endswith(" INFO master_server.logs: unit 3: it works\n")
 
 
 def test_a_traceback_is_one_line_of_json(configured: Configure) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,11 +16,12 @@ import pytest
 
 from edge_unit.config import ENVIRONMENT_PREFIX, UnitConfig
 from edge_unit.sources.simulated import SimulatedSourceConfig
+from geometry.compilation.kernel_state import FOLDERS
 from qualification import image as image_test
 from qualification.image import Watch, main, why_not
 from qualification.machines.arm64_boards import Board
 from qualification.machines.containers import MachineError
-from qualification.machines.image_parts import KERNEL_FILES, forget_all_but_newest, state_of_kernels
+from qualification.machines.image_parts import COMPILED_BY, forget_all_but_newest, state_to_compile
 from shared.configuration import load
 
 CHECKOUT = Path(__file__).parents[2]
@@ -150,34 +152,28 @@ def test_the_last_line_is_json_whatever_happened(
 # ---------------------------------------------------------------- kernels of an earlier run
 
 
-@pytest.mark.parametrize("pattern", KERNEL_FILES)
-def test_a_change_of_a_kernel_is_another_state(tmp_path: Path, pattern: str) -> None:
-    file = tmp_path / pattern.replace("*", "voxelize")
-    file.parent.mkdir(parents=True)
-    file.write_text("one")
-    before = state_of_kernels(tmp_path, LOCK)
-    file.write_text("two")
-    assert state_of_kernels(tmp_path, LOCK) != before
+@pytest.fixture
+def sources(tmp_path: Path) -> Path:
+    """A copy of all files that decide what is compiled."""
+    for name in (*FOLDERS, *COMPILED_BY):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        copy = shutil.copytree if (CHECKOUT / name).is_dir() else shutil.copy
+        copy(CHECKOUT / name, tmp_path / name)
+    return tmp_path
 
 
-def test_another_compiler_is_another_state_and_another_client_is_not(tmp_path: Path) -> None:
-    before = state_of_kernels(tmp_path, LOCK)
-    assert state_of_kernels(tmp_path, reversed(LOCK)) == before
-    assert state_of_kernels(tmp_path, (*LOCK[:2], "httpx==0.29.0 --hash=sha256:33")) == before
-    assert state_of_kernels(tmp_path, ("numba==0.68.2 --hash=sha256:44", *LOCK[1:])) != before
+@pytest.mark.parametrize("name", [f"{FOLDERS[0]}/voxelize.py", *COMPILED_BY])
+def test_a_change_of_a_kernel_is_another_state(sources: Path, name: str) -> None:
+    before = state_to_compile(sources, LOCK)
+    (sources / name).write_text("two")
+    assert state_to_compile(sources, LOCK) != before
 
 
-def test_all_files_that_have_kernels_are_known() -> None:
-    known = {file for pattern in KERNEL_FILES for file in CHECKOUT.glob(pattern)}
-    assert all(list(CHECKOUT.glob(pattern)) for pattern in KERNEL_FILES)
-    having = {
-        file
-        for package in ("shared", "edge_unit", "simulation")
-        for file in (CHECKOUT / package).rglob("*.py")
-        if "import kernel\n" in file.read_text()
-    }
-    # The truth is for who evaluates a simulation: no board looks for it.
-    assert having - known == {CHECKOUT / "simulation/cameras/truth.py"}
+def test_another_compiler_is_another_state_and_another_client_is_not(sources: Path) -> None:
+    before = state_to_compile(sources, LOCK)
+    assert state_to_compile(sources, reversed(LOCK)) == before
+    assert state_to_compile(sources, (*LOCK[:2], "httpx==0.29.0 --hash=sha256:33")) == before
+    assert state_to_compile(sources, ("numba==0.68.2 --hash=sha256:44", *LOCK[1:])) != before
 
 
 def test_kernels_that_were_used_last_are_kept(tmp_path: Path) -> None:

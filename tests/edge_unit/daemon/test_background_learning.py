@@ -11,7 +11,7 @@ import pytest
 from edge_unit.daemon.background_learning import Learning
 from edge_unit.daemon.background_store import BackgroundStore, Place
 from edge_unit.pipeline import DepthPipeline
-from edge_unit.sources import CameraInfo
+from edge_unit.sources.frame import CameraInfo
 from shared.camera import Intrinsics
 from shared.cell import Cell
 from shared.messages import DONE, Command

@@ -9,7 +9,7 @@ import pytest
 
 from edge_unit.daemon.background_store import BackgroundStore, Place
 from edge_unit.pipeline import Reference
-from edge_unit.sources import CameraInfo
+from edge_unit.sources.frame import CameraInfo
 from shared.camera import Intrinsics
 from shared.transforms import from_xyz_rpy
 

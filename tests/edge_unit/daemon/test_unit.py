@@ -28,7 +28,7 @@ from edge_unit.daemon.refinement_task import REFINE_FRAMES
 from edge_unit.daemon.unit import Unit
 from edge_unit.daemon.warm_up import rehearse
 from edge_unit.monitoring import read_trace
-from edge_unit.sources import CameraInfo, DepthFrame
+from edge_unit.sources.frame import CameraInfo, DepthFrame
 from edge_unit.sources.image import ImageFrame, ImageInfo, ImageStream
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from edge_unit.uplink import uplink as uplink_module

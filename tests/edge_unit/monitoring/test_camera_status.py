@@ -12,7 +12,7 @@ import pytest
 from edge_unit.config import UnitConfig
 from edge_unit.monitoring import CameraStanding
 from edge_unit.monitoring.last_camera import CameraMemory
-from edge_unit.sources import CameraInfo
+from edge_unit.sources.frame import CameraInfo
 from edge_unit.sources.realsense.source import RealsenseSourceConfig
 from shared.camera import Intrinsics
 from shared.errors import SourceError

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from edge_unit.monitoring.last_camera import CameraMemory
-from edge_unit.sources import CameraInfo
+from edge_unit.sources.frame import CameraInfo
 from shared.camera import Intrinsics
 from shared.files import STATE_MAX_BYTES
 

@@ -13,7 +13,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from edge_unit.sources import DepthFrame
+from edge_unit.sources.frame import DepthFrame
 from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import SourceError

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from edge_unit.sources import DepthFrame, DepthSource
+from edge_unit.sources.frame import DepthFrame, DepthSource
 from edge_unit.sources.simulated import SimulatedSource, SimulatedSourceConfig
 from shared.cell import Cell
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns

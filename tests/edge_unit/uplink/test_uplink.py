@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from edge_unit.pipeline import SeenBlocks
-from edge_unit.sources import CameraInfo
+from edge_unit.sources.frame import CameraInfo
 from edge_unit.uplink import uplink as module
 from edge_unit.uplink.cell_cache import CellCache
 from edge_unit.uplink.client import TIMEOUT, MasterClient

@@ -17,7 +17,7 @@ from shared.errors import JitCacheError
 COMPILE = """
 import logging, sys
 logging.basicConfig(level=logging.WARNING, format="%(message)s")
-import edge_unit
+import geometry
 from geometry.compilation.cache import settle
 if len(sys.argv) > 1:
     settle(sys.argv[1])
@@ -118,12 +118,9 @@ def test_each_state_of_the_kernels_has_a_folder_of_its_own(tmp_path: Path, monke
     """numba would not see that a kernel or a constant in another file has changed."""
     monkeypatch.setattr(jit_cache.os, "environ", dict(os.environ))
     monkeypatch.setattr(numba.config, "CACHE_DIR", numba.config.CACHE_DIR)
-    kernels = tmp_path / "kernels"
-    kernels.mkdir()
-    monkeypatch.setattr(jit_cache, "KERNELS", kernels)
     folders = []
     for state in range(jit_cache.STATES_MAX + 2):
-        (kernels / "some.py").write_text(f"NUMBER = {state}\n")
+        monkeypatch.setattr(jit_cache, "state_of_kernels", lambda state=state: f"{state:012x}")
         folders.append(jit_cache.settle(tmp_path / "cache"))
         os.utime(folders[-1], (state, state))
         assert jit_cache.settle(folders[-1]) == folders[-1]

@@ -24,8 +24,8 @@ needs_target = pytest.mark.skipif(HERE is None or not HERE.runs_here(), reason="
 COMPILE = """
 import sys
 from pathlib import Path
-import edge_unit
-from edge_unit import carried_kernels
+import geometry
+from geometry.compilation import prebuilt
 from geometry.compilation.cache import settle, settle_for
 if sys.argv[1] == "carry":
     settle_for(prebuilt.target_of(sys.argv[3]), Path(sys.argv[2]))

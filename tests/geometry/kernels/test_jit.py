@@ -17,7 +17,7 @@ import logging, time
 started_s = time.clock_gettime(time.CLOCK_MONOTONIC)
 logging.basicConfig(level=logging.WARNING, format="%(message)s")
 import numpy as np
-from edge_unit.pipeline.depth_pipeline import DepthPipeline
+from edge_unit.pipeline import DepthPipeline
 from shared.camera import Intrinsics
 from shared.cell import Cell
 from shared.transforms import look_at

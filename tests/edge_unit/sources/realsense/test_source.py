@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from edge_unit.sources import CameraInfo, DepthFrame, ReportsStatus, SourceStatus
+from edge_unit.sources.frame import CameraInfo, DepthFrame
 from edge_unit.sources.realsense.source import RealsenseSource, RealsenseSourceConfig
+from edge_unit.sources.status import ReportsStatus, SourceStatus
 from shared.camera import Intrinsics
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import SourceError

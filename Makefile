@@ -11,6 +11,11 @@ MINUTES ?= 30
 EXTRAS := edge,master,realsense,sim,dev
 VENV := .venv
 BIN := $(VENV)/bin
+PYTEST := $(BIN)/python -m pytest -q
+# Of the tests that need no quiet machine, as many at once as there are cores; the others one by one.
+WORKERS ?= logical
+# pytest's exit code where ARGS names none of either kind.
+NO_TESTS := 5
 READY := $(VENV)/ready
 BENCH_READY := $(VENV)/ready-bench
 TYPED := $(patsubst %/,%,$(dir $(wildcard $(addsuffix /__init__.py,shared geometry edge_unit master_server simulation benchmarks qualification))))
@@ -89,7 +94,10 @@ pictures: $(READY) ## the pictures of the README, painted anew
 	@$(BIN)/python -m simulation.demo.window_pictures assets/pictures
 
 test: $(READY) libusb lint ## lint, then all tests but the slow ones; with SLOW=1 these too
-	@$(BIN)/python -m pytest -q $(if $(SLOW),,-m "not slow") $(ARGS)
+	@failed=0; \
+	$(PYTEST) -n $(WORKERS) -m "not alone$(if $(SLOW),, and not slow)" $(ARGS) || [ $$? -eq $(NO_TESTS) ] || failed=1; \
+	$(PYTEST) -m "alone$(if $(SLOW),, and not slow)" $(ARGS) || [ $$? -eq $(NO_TESTS) ] || failed=1; \
+	exit $$failed
 
 lint: $(READY) ## ruff and mypy
 	@failed=0; \

@@ -27,6 +27,8 @@ from shared.lattice import Lattice
 from shared.wire import decode_update, encode_update, keys_from_bytes
 from simulation.world.world import DEMO_CELL
 
+pytestmark = pytest.mark.alone
+
 LATTICE = Lattice((-1.5, -1.5, -0.75), 0.05, (60, 60, 45))
 BLOCKS = Lattice((-1.5, -1.5, -0.75), 0.1, (30, 30, 23))
 ANSWER = msgpack.packb({"received_at_ns": 1, "answered_at_ns": 2, "joints": [(7, b"", None)]})

@@ -18,6 +18,8 @@ from shared.discovery import SERVICE_TYPE, AddressChanges, Announcement, Announc
 from shared.errors import WireError
 from shared.waiting import within
 
+pytestmark = pytest.mark.alone
+
 LOOPBACK = IPv4Interface("127.0.0.1/8")
 FIRST, SECOND = IPv4Interface("10.0.0.2/24"), IPv4Interface("192.168.0.3/24")
 SAYS = Announcement("demo", "ab" * 32, 3, True, "cd" * 32)

@@ -15,6 +15,8 @@ import pytest
 
 from shared.service import MAX_STATUS, ServiceManager
 
+pytestmark = pytest.mark.alone
+
 
 class Manager:
     """A service manager's end of the socket."""

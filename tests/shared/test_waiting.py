@@ -9,6 +9,8 @@ import pytest
 
 from shared.waiting import at_once_or_within, within
 
+pytestmark = pytest.mark.alone
+
 
 async def test_done_or_not() -> None:
     event = asyncio.Event()

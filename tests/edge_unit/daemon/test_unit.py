@@ -49,6 +49,8 @@ from tests.edge_unit import scenes
 from tests.master_server.fakes import cell as make_cell
 from tests.master_server.fakes import master as make_master
 
+pytestmark = pytest.mark.alone
+
 TOKEN = "unit-token-0123456789"
 IP = "10.0.0.1"
 # So few pixels with the noise of a real camera: its imagers stand a metre apart.

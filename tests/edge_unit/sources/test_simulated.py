@@ -25,6 +25,8 @@ from simulation.cameras.truth import TruthFinder
 from simulation.world.handling import LEFT_ALONE, Handling
 from simulation.world.world import DEMO_CELL, World
 
+pytestmark = pytest.mark.alone
+
 WAIT_S = 20.0
 """Kernels may have to be compiled first."""
 

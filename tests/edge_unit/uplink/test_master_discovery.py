@@ -21,6 +21,8 @@ from shared.clock import NS_PER_S, monotonic_ns
 from shared.discovery import Announcement, Offer
 from shared.messages import CONTRACT_VERSION
 
+pytestmark = pytest.mark.alone
+
 LOST_NS = round(LOST_S * NS_PER_S)
 
 

@@ -41,6 +41,8 @@ from shared.settings import Settings
 from shared.transforms import from_xyz_rpy
 from shared.wire import unpack_seen
 
+pytestmark = pytest.mark.alone
+
 CAMERA = CameraInfo("A", "model", Intrinsics(8, 6, 10.0, 10.0, 4.0, 3.0))
 POSE = from_xyz_rpy((1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
 CELL = Cell("cell", np.zeros(3), np.ones(3))

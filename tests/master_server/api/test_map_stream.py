@@ -21,6 +21,8 @@ from shared.messages import JointsRequest
 from shared.waiting import within
 from tests.master_server.fakes import MS, FakeUnit, joined, master, sees_all
 
+pytestmark = pytest.mark.alone
+
 KEYS = Wish("keys")
 SLACK_NS = 50 * MS
 """What the push of a moment that has come may take."""

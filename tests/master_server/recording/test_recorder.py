@@ -31,6 +31,8 @@ from shared.meshes import box_mesh
 from shared.messages import JointsRequest
 from tests.master_server.fakes import MS, START_NS, S, joined, master, sees_all
 
+pytestmark = pytest.mark.alone
+
 WALL_LESS_MONOTONIC_NS = 1_700_000_000 * S
 PATIENCE_S = 10.0
 

@@ -22,6 +22,8 @@ from shared.waiting import within
 from tests.master_server.fakes import master
 from tests.master_server.test_app import OPERATOR, UNIT
 
+pytestmark = pytest.mark.alone
+
 HEAD_S, MESSAGE_S = 0.3, 0.9
 SLACK_S = 1.0
 """On a busy machine."""

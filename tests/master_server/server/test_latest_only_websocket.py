@@ -28,6 +28,8 @@ from shared.clock import NS_PER_S, monotonic_ns
 from shared.waiting import within
 from tests.master_server.fakes import MS, joined, master, sees_all
 
+pytestmark = pytest.mark.alone
+
 UNIT = "unit-token-0123456789"
 OPERATOR = "operator-token-0123456789"
 WAIT_S = 5.0

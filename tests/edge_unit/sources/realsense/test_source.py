@@ -25,6 +25,8 @@ from simulation.cameras.pluggable import command, plug
 from tests.edge_unit.sources.realsense import recordings
 from tests.edge_unit.sources.realsense.recordings import depth_of
 
+pytestmark = pytest.mark.alone
+
 FRAMES = 45
 
 

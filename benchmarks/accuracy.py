@@ -35,8 +35,8 @@ from benchmarks.ground_truth.plan import (
 )
 from benchmarks.ground_truth.real import Judged
 from benchmarks.ground_truth.rules import MinimumPoints, Paper, Place
-from benchmarks.ground_truth.stage import Stage
 from benchmarks.ground_truth.surface import visible_pixels_min
+from benchmarks.ground_truth.things import before_wall
 from benchmarks.ground_truth.trials import Tallies, Trial
 from benchmarks.reporting.report import RESULTS, Mark, line, write
 from benchmarks.sweeps import runner
@@ -184,7 +184,7 @@ def document_of(curves: list[Curve], amount: Amount, settings: FilterSettings) -
             by_thing(curves, "distance", "recall_strict_percent", OURS, amount.things),
             by_thing(curves, "distance", "recall_percent", plan.PAPER, amount.things),
         ]
-    stage = Stage(1.0, 1.0, DepthNoise(), 0)
+    stage = before_wall(1.0, 1.0, DepthNoise(), 0)
     place = Place(stage.intrinsics, stage.T_world_camera, stage.cell)
     size_m = settings.voxel_size_m
     return {

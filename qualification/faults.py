@@ -41,7 +41,7 @@ from qualification.networks import UNIT_IP, Cable, Proxy, confine, run
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError
 from simulation.fleet.fleet import MASTER_PREFIX
-from simulation.fleet.processes import Processes, raise_when_stopped
+from simulation.fleet.processes import Processes
 
 HOLD_S = 1.5
 """A fault lasts this long after it could be noticed: long enough for retries to be at their slowest."""
@@ -107,14 +107,14 @@ async def again(site: Site, course: Course, **how: Any) -> None:
 # ---------------------------------------------------------------------- processes
 
 
-async def unit_killed(site: Site, course: Course) -> None:
-    """A unit is killed while something comes before it."""
+async def unit_killed(site: Site, course: Course, **how: Any) -> None:
+    """A unit is killed while something comes before it, and started again as `how` says."""
     await ordinary(site)
     begin(course)
     await site.kill(site.units[FIRST])
     site.newcomer()
     await hold(0.0)
-    await again(site, course)
+    await again(site, course, **how)
     await site.settled()
 
 
@@ -194,17 +194,7 @@ def wall_clock(index: int | None, by_s: int) -> Callable[[Site, Course], Awaitab
 
 def monotonic_clock(by_s: int) -> Callable[[Site, Course], Awaitable[None]]:
     """A unit is started again, and its monotonic clock begins elsewhere, as that of another board."""
-
-    async def strike(site: Site, course: Course) -> None:
-        await ordinary(site)
-        begin(course)
-        await site.kill(site.units[FIRST])
-        site.newcomer()
-        await hold(0.0)
-        await again(site, course, under=monotonic_elsewhere(by_s))
-        await site.settled()
-
-    return strike
+    return partial(unit_killed, under=monotonic_elsewhere(by_s))
 
 
 # ---------------------------------------------------------------------- networks
@@ -617,10 +607,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(arguments)
     try:
-        if not options.inside:
-            confine("qualification.faults", arguments)
-        raise_when_stopped()
-        run("ip", "link", "set", "lo", "up")
+        confine("qualification.faults", arguments, options.inside)
         chosen = [fault for fault in FAULTS if not options.names or fault.name in options.names]
         rows = asyncio.run(strike_all(chosen))
     except CellwatchError as error:

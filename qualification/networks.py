@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import ConfigError
+from simulation.fleet.processes import raise_when_stopped
 
 MASTER_IP, UNIT_IP = "10.77.0.1", "10.77.0.2"
 """At the two ends of the cable."""
@@ -36,12 +37,18 @@ def allowed(unshare: Sequence[str]) -> bool:
         return False
 
 
-def confine(module: str, arguments: Sequence[str]) -> None:
-    """Run `python -m module --inside arguments` in this process's place, with a network and mounts of its own.
+def confine(module: str, arguments: Sequence[str], inside: bool) -> None:
+    """Go on with a network and mounts of our own, where a request to end raises KeyboardInterrupt.
+
+    Unless this process is `inside` already, `python -m module --inside arguments` takes its place.
 
     Raises:
         ConfigError: the kernel does not allow it.
     """
+    if inside:
+        raise_when_stopped()
+        run("ip", "link", "set", "lo", "up")
+        return
     for unshare in NAMESPACES:
         if allowed(unshare):
             os.execvp(unshare[0], (*unshare, sys.executable, "-m", module, "--inside", *arguments))

@@ -26,7 +26,7 @@ from edge_unit.config import ENVIRONMENT_PREFIX as UNIT_PREFIX
 from edge_unit.monitoring import read_trace
 from edge_unit.monitoring.pose_monitor import BASELINE_LOOKS, PERIOD_S
 from qualification.fault_site.site import FaultError
-from qualification.networks import confine, run
+from qualification.networks import confine
 from qualification.socket_site.judge import Frames, Judge, first_voxel_s, pose_errors, true_pose
 from qualification.socket_site.site import OTHER_HOST, TRACE, UNITS, PluggedUnit, PlugSite, pose_of
 from qualification.socket_site.switch import Switch
@@ -36,7 +36,7 @@ from shared.errors import CellwatchError
 from shared.settings import Settings
 from shared.transforms import Transform
 from simulation.fleet.fleet import MASTER_PREFIX
-from simulation.fleet.processes import Processes, raise_when_stopped
+from simulation.fleet.processes import Processes
 from simulation.world.handling import Handling
 from simulation.world.world import DEMO_CELL
 
@@ -355,10 +355,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(arguments)
     try:
-        if not options.inside:
-            confine("qualification.plug_and_play", arguments)
-        raise_when_stopped()
-        run("ip", "link", "set", "lo", "up")
+        confine("qualification.plug_and_play", arguments, options.inside)
         folder = options.folder or Path(tempfile.mkdtemp(prefix="cellwatch-plug-"))
         try:
             found = asyncio.run(play(folder, options.quiet_seconds))

@@ -28,7 +28,7 @@ from benchmarks.reporting.report import RESULTS, Mark, Result, line, write
 from edge_unit.config import ENVIRONMENT_PREFIX as UNIT_PREFIX
 from qualification.fault_site.site import START_S, FaultError
 from qualification.fault_site.watch import SETTLED_S
-from qualification.networks import confine, run
+from qualification.networks import confine
 from qualification.soak_site.schedule import Strike, schedule
 from qualification.soak_site.site import KINDS, SoakSite
 from qualification.soak_site.usage import (
@@ -43,7 +43,7 @@ from qualification.soak_site.usage import (
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError
 from simulation.fleet.fleet import MASTER_PREFIX
-from simulation.fleet.processes import Processes, raise_when_stopped
+from simulation.fleet.processes import Processes
 
 MINUTES = 30.0
 
@@ -319,11 +319,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(arguments)
     try:
-        if not options.inside:
-            seeded = () if options.seed is not None else ("--seed", str(random.SystemRandom().randrange(10**6)))
-            confine("qualification.soak", (*arguments, *seeded))
-        raise_when_stopped()
-        run("ip", "link", "set", "lo", "up")
+        seeded = () if options.seed is not None else ("--seed", str(random.SystemRandom().randrange(10**6)))
+        confine("qualification.soak", (*arguments, *seeded), options.inside)
         seconds = 60.0 * options.minutes if options.seconds is None else options.seconds
         print(f"A cell for {seconds:g} s; the same again with --seed {options.seed}", file=sys.stderr, flush=True)
         with _folder() as folder:

@@ -3,7 +3,7 @@
 
 In the order of the flow:
 
-    stage  a camera askew to the lattice, a wall, and a thing of a known shape between them
+    things a stage askew to the lattice, a wall on it, and things of known shapes before that
     rules  what is compared: ours, the paper's own rule, a least number of points
     surface what was reported, held against the surface that was there
     trials all of them before the same frames

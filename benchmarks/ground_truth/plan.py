@@ -18,7 +18,7 @@ from benchmarks.ground_truth.rules import (
     Paper,
     Rule,
 )
-from benchmarks.ground_truth.stage import CYLINDERS, THINGS
+from benchmarks.ground_truth.things import CYLINDERS, THINGS
 from benchmarks.ground_truth.trials import Entry, QuietTrial, Trial
 from benchmarks.real_frames import EMPTY_FRAMES
 from benchmarks.sweep_scenes.quiet import CAMERAS

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.ground_truth.rules import Filter, Measured, Place, Rule
-from benchmarks.ground_truth.stage import TILT_MAX_RAD, Stage
 from benchmarks.ground_truth.surface import Judge, Surface, Tally
+from benchmarks.ground_truth.things import TILT_MAX_RAD, before_wall, placed
 from benchmarks.sweep_scenes.quiet import CAMERAS, FRAME_S
 from benchmarks.sweep_scenes.shapes import SPECKLE_PX, blob
 from edge_unit.pipeline import DepthPipeline
@@ -62,18 +62,18 @@ class Trial:
     def run(self) -> Tallies:
         """What came of each entry."""
         noise = DepthNoise()
-        stage = Stage(self.distance_m, self.behind_m, noise, self.seed)
+        stage = before_wall(self.distance_m, self.behind_m, noise, self.seed)
         place = Place(stage.intrinsics, stage.T_world_camera, stage.cell)
         known_m = DepthPipeline(place.intrinsics, place.T_world_camera, place.cell).expected_depth(None)
         no_robot = np.zeros(stage.intrinsics.shape, np.bool_)
         contest = Contest(place, self.entries, noise)
         rng = np.random.default_rng(self.seed)
         for _ in range(self.frames):
-            bodies = stage.place(self.thing, rng, self.tilt_max_rad) if self.thing else ()
-            depth, view = stage.frame(bodies)
-            _speckle(self.blobs, depth, rng, stage.distance_m + self.behind_m, place.intrinsics)
-            surface = Surface.of(view, place, noise, rng)
-            contest.hold(Measured(depth, None, known_m, no_robot), surface)
+            bodies = placed(self.thing, self.distance_m, rng, self.tilt_max_rad) if self.thing else ()
+            frame = stage.frame(*bodies)
+            _speckle(self.blobs, frame.depth, rng, self.distance_m + self.behind_m, place.intrinsics)
+            surface = Surface.of(frame.view, place, noise, rng)
+            contest.hold(Measured(frame.depth, None, known_m, no_robot), surface)
         return contest.tallies
 
 

@@ -32,7 +32,7 @@ import msgpack
 import numpy as np
 import psutil
 
-from benchmarks.load_generator.traffic import AGE_NS, FIRST_ADDRESS, VIEWS, SimpleUnit, captured_head, view
+from benchmarks.load_generator.traffic import AGE_NS, VIEWS, SimpleUnit, address_of, captured_head, view
 from edge_unit.uplink.client import MasterClient
 from shared.camera import Intrinsics
 from shared.cell import Cell
@@ -268,7 +268,7 @@ async def registered(plan: Plan, token: str) -> list[SimpleUnit]:
     head = await captured_head(plan.url, token)
     units = []
     for number in range(plan.units):
-        unit = SimpleUnit(str(FIRST_ADDRESS + number), views[number % VIEWS], 11 * number, head)
+        unit = SimpleUnit(address_of(number), views[number % VIEWS], 11 * number, head)
         units.append(unit)
         if not plan.bare:
             await register(unit, plan.url, token)

@@ -21,7 +21,7 @@ import numpy as np
 import psutil
 
 from benchmarks.load_generator.load import Generator, Plan, map_is_right, register
-from benchmarks.load_generator.traffic import FIRST_ADDRESS, VIEWS, SimpleUnit, View, captured_head, view
+from benchmarks.load_generator.traffic import VIEWS, SimpleUnit, View, address_of, captured_head, view
 from shared.cell import Cell
 from shared.clock import NS_PER_S, NS_PER_US, monotonic_ns
 from shared.errors import CellwatchError, MasterRefused
@@ -167,7 +167,7 @@ def _views(plan: ScalePlan, rate_hz: float) -> list[View]:
 
 async def _registered(plan: ScalePlan, token: str, head: bytes, count: int) -> list[LoggingUnit]:
     nothing = View((b"",), (), ())
-    units = [LoggingUnit(str(FIRST_ADDRESS + number), nothing, 0, head) for number in range(count)]
+    units = [LoggingUnit(address_of(number), nothing, 0, head) for number in range(count)]
     for unit in units:
         await register(unit, plan.url, token)
     return units

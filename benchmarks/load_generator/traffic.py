@@ -103,6 +103,11 @@ def _towards(angle_rad: float) -> NDArray[np.float64]:
     return np.array((math.cos(angle_rad), math.sin(angle_rad), 0.0))
 
 
+def address_of(number: int) -> str:
+    """The IP address of a unit on this machine."""
+    return str(FIRST_ADDRESS + number)
+
+
 @dataclass(eq=False)
 class SimpleUnit:
     """A unit that is nothing but its messages. Times are CLOCK_MONOTONIC, the master's own."""

@@ -18,7 +18,7 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.load_generator.traffic import FIRST_ADDRESS, captured_head, with_head
+from benchmarks.load_generator.traffic import address_of, captured_head, with_head
 from benchmarks.paper_experiment.contenders import Sight
 from edge_unit.uplink.client import MasterClient
 from shared.camera import Intrinsics
@@ -87,11 +87,6 @@ class Member:
         if answer.versions != self.versions:
             raise UplinkError(f"unit {self.number}: expected versions {self.versions}, got {answer.versions}")
         self.exchange = Exchange(update.sent_at_ns, answer.received_at_ns, answer.answered_at_ns, monotonic_ns())
-
-
-def address_of(number: int) -> str:
-    """The IP address of a unit on this machine."""
-    return str(FIRST_ADDRESS + number)
 
 
 class MapReader:

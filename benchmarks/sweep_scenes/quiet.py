@@ -20,7 +20,7 @@ from simulation.world.world import World
 CAMERAS = 4
 
 FRAME_S = 0.137
-"""Between frames; no part of the robot's period, so that it is met in ever other poses."""
+"""Between frames; no part of the robot's period nor of a step's, so that both are met in ever other poses."""
 
 LEARNED_FRAMES = 100
 """Ten seconds of the empty cell at ten frames a second: the robot's shadow fills in."""

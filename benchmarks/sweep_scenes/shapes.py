@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.reporting.report import Mark, Result
-from benchmarks.sweep_scenes.stage import Stage, reported_at
+from benchmarks.sweep_scenes.stage import Stage, above_table, lying, reported_at
 from edge_unit.pipeline import DepthPipeline
 from shared.camera import Intrinsics
 from shared.meshes import box_mesh, cylinder_mesh
@@ -75,11 +75,10 @@ class Tally:
 
 def plates(camera: str, distance_m: float, step_m: float, settings: FilterSettings) -> Tally:
     """A plate that faces the camera, moved in steps through the depth of two voxels."""
-    stage = Stage(distance_m + ROOM_M, CAMERAS[camera], seed=3)
-    compared = rules(settings, PLATE_VOXEL_M)
-    pipelines = {rule: stage.pipeline(chosen) for rule, chosen in compared.items()}
+    stage = above_table(distance_m + ROOM_M, CAMERAS[camera], seed=3)
+    pipelines = _pipelines(stage, settings, PLATE_VOXEL_M)
     mesh = box_mesh("plate", (PLATE_M, PLATE_M, PLATE_THICK_M))
-    lost = dict.fromkeys(compared, 0)
+    lost = dict.fromkeys(pipelines, 0)
     steps = round(2.0 * PLATE_VOXEL_M / step_m)
     for k in range(steps):
         z_m = ROOM_M - PLATE_VOXEL_M + k * step_m
@@ -99,12 +98,11 @@ def rods(camera: str, voxel_m: float, tilt_max_deg: float, poses: int, settings:
 
     Up to 60 degrees from the image plane all tilts are equally frequent; at 90, all directions of space.
     """
-    stage = Stage(ROD_DISTANCE_M + ROOM_M, CAMERAS[camera], seed=4)
-    compared = rules(settings, voxel_m)
-    pipelines = {rule: stage.pipeline(chosen) for rule, chosen in compared.items()}
+    stage = above_table(ROD_DISTANCE_M + ROOM_M, CAMERAS[camera], seed=4)
+    pipelines = _pipelines(stage, settings, voxel_m)
     mesh = cylinder_mesh("rod", ROD_RADIUS_M, ROD_LENGTH_M)
     rng = np.random.default_rng(5)
-    lost = dict.fromkeys(compared, 0)
+    lost = dict.fromkeys(pipelines, 0)
     for _ in range(poses):
         body = Body("rod", mesh, _rod_pose(rng, tilt_max_deg), Owner.UNKNOWN)
         _tally(stage, body, pipelines, lost)
@@ -113,13 +111,10 @@ def rods(camera: str, voxel_m: float, tilt_max_deg: float, poses: int, settings:
 
 
 def _rod_pose(rng: np.random.Generator, tilt_max_deg: float) -> Transform:
-    """A cylinder's axis is its z."""
     heading = rng.uniform(0.0, 2.0 * math.pi)
     tilt = math.asin(rng.uniform(0.0, 1.0)) if tilt_max_deg >= 90.0 else math.radians(rng.uniform(0.0, tilt_max_deg))
-    axis = np.array((math.cos(tilt) * math.cos(heading), math.cos(tilt) * math.sin(heading), math.sin(tilt)))
-    side = np.array((-math.sin(heading), math.cos(heading), 0.0))
     place = (*rng.uniform(-ROD_PLACES_M, ROD_PLACES_M, 2), ROOM_M + rng.uniform(-0.05, 0.05))
-    return from_rotation_translation(np.stack((np.cross(side, axis), side, axis), axis=1), place)
+    return from_rotation_translation(lying(heading, tilt), place)
 
 
 # ---------------------------------------------------------------------------------------------------- speckle
@@ -130,14 +125,13 @@ def speckle(voxel_m: float, frames: int, settings: FilterSettings) -> Tally:
 
     Counts the frames in which it is reported; half of them have the largest blob.
     """
-    stage = Stage(SPECKLE_DISTANCE_M + ROOM_M, CAMERAS["D435i"], seed=6)
-    compared = rules(settings, voxel_m)
-    pipelines = {rule: stage.pipeline(chosen) for rule, chosen in compared.items()}
+    stage = above_table(SPECKLE_DISTANCE_M + ROOM_M, CAMERAS["D435i"], seed=6)
+    pipelines = _pipelines(stage, settings, voxel_m)
     sigma_m = float(DepthNoise().sigma_of(np.array([SPECKLE_DISTANCE_M]), stage.intrinsics)[0])
     rng = np.random.default_rng(7)
-    reported = dict.fromkeys(compared, 0)
+    reported = dict.fromkeys(pipelines, 0)
     for k in range(frames):
-        depth = stage.frame()
+        depth = stage.frame().depth
         pixels = SPECKLE_PX if k % 2 else int(rng.integers(1, SPECKLE_PX + 1))
         rows, columns = blob(rng, pixels, stage.intrinsics)
         # A blob is one wrong match: all of it lies at one depth, but for the noise of each pixel.
@@ -186,8 +180,13 @@ def _marks(tallies: list[Tally], ours: str) -> list[Mark]:
     return marks
 
 
+def _pipelines(stage: Stage, settings: FilterSettings, voxel_m: float) -> dict[str, DepthPipeline]:
+    """A filter for each of the rules."""
+    return {rule: stage.pipeline(chosen) for rule, chosen in rules(settings, voxel_m).items()}
+
+
 def _tally(stage: Stage, body: Body, pipelines: dict[str, DepthPipeline], lost: Lost) -> None:
     """One frame with `body` before every rule."""
-    depth = stage.frame(body)
+    depth = stage.frame(body).depth
     for rule, pipeline in pipelines.items():
         lost[rule] += not reported_at(pipeline.process(depth, None), body)

@@ -1,25 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One camera that looks straight down, and one thing below it: a bare scene whose every pixel is a ray cast by Embree.
+"""One D435i, faults and all, and things before it: a bare scene whose every pixel is a ray cast by Embree.
 
-The world's z axis points at the camera, which hangs `height_m` above the origin; a table, if there is one, has its
-top at z = 0.
+`make sweeps` has the camera look straight down at a table: the world's z axis points at it, and the table's top is at
+z = 0. `make bench-accuracy` has a wall, see `benchmarks.ground_truth.things`.
 """
 
 from __future__ import annotations
+
+import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_unit.pipeline import DepthPipeline, Voxels
-from shared.camera import Intrinsics
 from shared.cell import Cell, PlacedMesh
 from shared.meshes import box_mesh
 from shared.settings import FilterSettings
 from shared.transforms import Transform, apply, from_rotation_translation
-from simulation.cameras.camera import d435i_intrinsics
+from simulation.cameras.camera import SimulatedFrame, d435i_intrinsics
 from simulation.cameras.depth_noise import DepthNoise, DepthSensor
 from simulation.cameras.raycast import RaycastRenderer
-from simulation.world.scene import Body, Capsules, Owner, Scene
+from simulation.world.scene import Body
+from simulation.world.world import World
 
 FACING_DOWN = np.diag((1.0, -1.0, -1.0))
 
@@ -29,41 +32,54 @@ HALF_WIDTH_M = 4.0
 CELL_HALF_M = 1.0
 """Things stand within this of the optical axis; the cell is no larger, so that it is quick to make."""
 
+SLAB_THICK_M = 0.02
+
 BLUR_M = 0.05
 """Two standard deviations of depth at 2 m."""
 
 
 class Stage:
-    """A D435i above an empty table (or above nothing), to which one thing at a time is added."""
+    """A D435i in a cell whose static bodies are all that stands still; things are put before it for one frame."""
 
-    def __init__(
-        self, height_m: float, noise: DepthNoise, seed: int, table: bool = True, intrinsics: Intrinsics | None = None
-    ) -> None:
-        self.height_m = height_m
-        self.intrinsics = intrinsics or d435i_intrinsics()
-        self.T_world_camera: Transform = from_rotation_translation(FACING_DOWN, (0.0, 0.0, height_m))
-        slab = box_mesh("table", (2.0 * HALF_WIDTH_M, 2.0 * HALF_WIDTH_M, 0.02))
-        below = from_rotation_translation(np.eye(3), (0.0, 0.0, -0.01))
-        self._fixed = (Body("table", slab, below, Owner.STATIC),) if table else ()
-        self._known = (PlacedMesh("table", slab, below),) if table else ()
-        self._renderer = RaycastRenderer(self.intrinsics, self.T_world_camera)
+    def __init__(self, T_world_camera: Transform, cell: Cell, noise: DepthNoise, seed: int) -> None:
+        self.intrinsics = d435i_intrinsics()
+        self.T_world_camera = T_world_camera
+        self.cell = cell
+        self._empty = World(cell).scene(0.0)
+        self._renderer = RaycastRenderer(self.intrinsics, T_world_camera)
         self._sensor = DepthSensor(self.intrinsics, noise, seed)
         self._moment = 0
 
-    def frame(self, *things: Body) -> NDArray[np.uint16]:
-        """The next frame (H, W) with `things` on the stage; no two frames have the same noise."""
+    def frame(self, *things: Body) -> SimulatedFrame:
+        """The next frame with `things` on the stage; no two frames have the same noise."""
         self._moment += 1
-        scene = Scene(self._fixed, things, Capsules.joined([]))
-        return self._sensor.measure(self._renderer.render(scene).z_m, self._moment)
+        view = self._renderer.render(replace(self._empty, moving=things))
+        return SimulatedFrame(self._sensor.measure(view.z_m, self._moment), view, None)
 
-    def cell(self, shift_m: float, cad: bool) -> Cell:
-        """The cell, its lattice's origin moved by `shift_m` along z; with `cad` the table is in it."""
-        low = (-CELL_HALF_M, -CELL_HALF_M, -0.5 - shift_m)
-        return Cell("stage", np.array(low), np.array((CELL_HALF_M, CELL_HALF_M, 3.0)), self._known if cad else ())
+    def pipeline(self, settings: FilterSettings, cell: Cell | None = None) -> DepthPipeline:
+        """A filter for this camera, in the stage's own cell unless it is to take it for another."""
+        return DepthPipeline(self.intrinsics, self.T_world_camera, cell or self.cell, settings)
 
-    def pipeline(self, settings: FilterSettings, shift_m: float = 0.0, cad: bool = True) -> DepthPipeline:
-        """A filter for this camera in that cell."""
-        return DepthPipeline(self.intrinsics, self.T_world_camera, self.cell(shift_m, cad), settings)
+
+def above_table(height_m: float, noise: DepthNoise, seed: int) -> Stage:
+    """A camera that hangs `height_m` above the middle of a table."""
+    table = slab("table", 2.0 * HALF_WIDTH_M, from_rotation_translation(np.eye(3), (0.0, 0.0, -0.5 * SLAB_THICK_M)))
+    low, high = (-CELL_HALF_M, -CELL_HALF_M, -0.5), (CELL_HALF_M, CELL_HALF_M, 3.0)
+    cell = Cell("stage", np.array(low), np.array(high), (table,))
+    return Stage(from_rotation_translation(FACING_DOWN, (0.0, 0.0, height_m)), cell, noise, seed)
+
+
+def slab(name: str, side_m: float, T_world_middle: Transform) -> PlacedMesh:
+    """A square slab, `SLAB_THICK_M` along its z."""
+    return PlacedMesh(name, box_mesh(name, (side_m, side_m, SLAB_THICK_M)), T_world_middle)
+
+
+def lying(heading_rad: float, tilt_rad: float) -> NDArray[np.float64]:
+    """A rotation (3, 3) that turns z, a cylinder's axis, to `heading_rad` in the xy plane and `tilt_rad` out of it."""
+    x, y = math.cos(heading_rad), math.sin(heading_rad)
+    axis = np.array((math.cos(tilt_rad) * x, math.cos(tilt_rad) * y, math.sin(tilt_rad)))
+    side = np.array((-y, x, 0.0))
+    return np.stack((np.cross(side, axis), side, axis), axis=1)
 
 
 def reported_at(voxels: Voxels, body: Body) -> bool:

@@ -8,14 +8,14 @@ camera straight above. The table is in CAD, or learned.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
 from benchmarks.reporting.report import Mark, Result
-from benchmarks.sweep_scenes.stage import Stage, reported_at
-from edge_unit.pipeline import DepthPipeline
+from benchmarks.sweep_scenes.stage import above_table, reported_at
+from edge_unit.pipeline import Voxels
 from shared.meshes import TriangleMesh, box_mesh
 from shared.settings import FilterSettings
 from shared.transforms import from_xyz_rpy
@@ -51,12 +51,15 @@ class Trial:
     """Boxes on a table at one distance, before one filter."""
 
     def __init__(self, distance_m: float, cad: bool, settings: FilterSettings, seed: int) -> None:
-        self._stage = Stage(distance_m, DepthNoise(), seed)
-        shifts_m = [settings.voxel_size_m * k / SHIFTS for k in range(SHIFTS)]
-        self._pipelines: list[DepthPipeline] = [self._stage.pipeline(settings, shift, cad) for shift in shifts_m]
+        self._stage = above_table(distance_m, DepthNoise(), seed)
+        known = self._stage.cell if cad else replace(self._stage.cell, static=())
+        shifts_m = [(0.0, 0.0, settings.voxel_size_m * k / SHIFTS) for k in range(SHIFTS)]
+        cells = [replace(known, box_min_m=known.box_min_m - shift_m) for shift_m in shifts_m]
+        self._pipelines = [self._stage.pipeline(settings, cell) for cell in cells]
+        self._highest_m = min(HIGHEST_M, distance_m - CLEARANCE_M)
         self._seed = seed
         if not cad:
-            reference = self._pipelines[0].learn((self._stage.frame(), None) for _ in range(LEARNED_FRAMES))
+            reference = self._pipelines[0].learn((self._stage.frame().depth, None) for _ in range(LEARNED_FRAMES))
             for pipeline in self._pipelines:
                 pipeline.use(reference)
 
@@ -69,18 +72,17 @@ class Trial:
             x, y = rng.uniform(-PLACES_M, PLACES_M, 2)
             pose = from_xyz_rpy((x, y, 0.5 * height_m), (0.0, 0.0, rng.uniform(0.0, math.pi)))
             body = Body("box", mesh, pose, Owner.UNKNOWN)
-            found += reported_at(self._pipelines[i % SHIFTS].process(self._stage.frame(body), None), body)
+            found += reported_at(self._voxels(i, body), body)
         return found / frames
 
     def empty_share(self, frames: int) -> float:
         """Share of the frames of the empty table in which anything is reported."""
-        found = sum(len(self._pipelines[i % SHIFTS].process(self._stage.frame(), None)) > 0 for i in range(frames))
+        found = sum(len(self._voxels(i)) > 0 for i in range(frames))
         return found / frames
 
     def thinnest_m(self, frames: int) -> float:
         """The thinnest box, in whole steps, that is reported often enough; NaN when not even the highest is."""
-        highest_m = min(HIGHEST_M, self._stage.height_m - CLEARANCE_M)
-        lost, kept = 0, round(highest_m / STEP_M)
+        lost, kept = 0, round(self._highest_m / STEP_M)
         if self.reported_share(kept * STEP_M, frames) < REPORTED_SHARE:
             return math.nan
         while kept - lost > 1:
@@ -90,6 +92,10 @@ class Trial:
             else:
                 lost = middle
         return kept * STEP_M
+
+    def _voxels(self, i: int, *boxes: Body) -> Voxels:
+        """What is reported of the next frame, on the lattice whose turn it is."""
+        return self._pipelines[i % SHIFTS].process(self._stage.frame(*boxes).depth, None)
 
 
 @dataclass(frozen=True)

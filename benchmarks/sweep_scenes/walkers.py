@@ -14,17 +14,13 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from benchmarks.reporting.report import Mark, Result
+from benchmarks.sweep_scenes.quiet import CAMERAS, FRAME_S
 from edge_unit.pipeline import DepthPipeline
 from shared.camera import Intrinsics
 from shared.settings import FilterSettings
 from simulation.cameras.camera import SimulatedCamera, rig
 from simulation.cameras.truth import TruthFinder, false_voxels, missed_voxels
 from simulation.world.world import World
-
-CAMERAS = 4
-
-FRAME_S = 0.137
-"""Between frames; no part of a step's or the robot's period."""
 
 MISSED_SHARE_MAX, FALSE_SHARE_MAX = 0.02, 0.005
 

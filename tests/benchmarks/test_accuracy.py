@@ -16,8 +16,8 @@ from benchmarks.ground_truth import real
 from benchmarks.ground_truth.curves import AXES, METRICS, Collection, Curve, worse
 from benchmarks.ground_truth.plan import BASELINES, OURS, POINTS
 from benchmarks.ground_truth.rules import Measured, MinimumPoints, Ours, Paper, Place, algorithm_1, algorithm_6, before
-from benchmarks.ground_truth.stage import THINGS, Stage
 from benchmarks.ground_truth.surface import TOOL_M, Judge, Surface, Tally, visible_pixels_min
+from benchmarks.ground_truth.things import THINGS, before_wall, placed
 from benchmarks.ground_truth.trials import Entry
 from benchmarks.reporting.plots import draw
 from edge_unit.pipeline import DepthPipeline
@@ -35,10 +35,10 @@ class Scene:
     """A perfect camera before one thing."""
 
     def __init__(self, thing: str, noise: DepthNoise | None = None, seed: int = 3) -> None:
-        stage = Stage(DISTANCE_M, BEHIND_M, noise or DepthNoise.none(), seed)
+        stage = before_wall(DISTANCE_M, BEHIND_M, noise or DepthNoise.none(), seed)
         self.place = Place(stage.intrinsics, stage.T_world_camera, stage.cell)
-        self.bodies = stage.place(thing, np.random.default_rng(seed))
-        self.depth, self.view = stage.frame(self.bodies)
+        frame = stage.frame(*placed(thing, DISTANCE_M, np.random.default_rng(seed)))
+        self.depth, self.view = frame.depth, frame.view
         self.pipeline = DepthPipeline(stage.intrinsics, stage.T_world_camera, stage.cell)
         known_m = self.pipeline.expected_depth(None)
         self.frame = Measured(self.depth, None, known_m, np.zeros(stage.intrinsics.shape, np.bool_))
@@ -82,7 +82,7 @@ def test_algorithms_1_and_6_are_as_the_paper_has_them() -> None:
     points_m = np.array([[0.0499, 0.0, -0.001], [0.0488, 0.12, 0.0]])
     # 0.0488 / 0.05 + 0.025 is 1.001: the constant has the wrong unit, and shifts by a fortieth of a voxel.
     assert algorithm_1(points_m, 0.05).tolist() == [[1.0, 0.0, 0.0], [1.0, 2.0, 0.0]]
-    camera = Stage(1.0, 1.0, DepthNoise.none(), 0).intrinsics
+    camera = before_wall(1.0, 1.0, DepthNoise.none(), 0).intrinsics
     full = algorithm_6(0.05, np.array([1.0, 2.0]), camera)
     columns = math.degrees(math.atan(0.05)) / (math.degrees(2 * math.atan(424 / 425)) / 848)
     rows = math.degrees(math.atan(0.05)) / (math.degrees(2 * math.atan(240 / 425)) / 480)

@@ -15,7 +15,7 @@ from scipy import ndimage
 from benchmarks import sweeps
 from benchmarks.reporting.report import Mark, Result
 from benchmarks.sweep_scenes import shapes
-from benchmarks.sweep_scenes.stage import Stage, reported_at
+from benchmarks.sweep_scenes.stage import above_table, reported_at
 from benchmarks.sweeps import Amount, quick
 from shared.meshes import box_mesh
 from shared.settings import FilterSettings
@@ -86,7 +86,7 @@ def test_the_first_rule_is_the_default_and_the_others_are_the_papers() -> None:
 
 
 def test_a_blob_is_one_piece_of_its_size() -> None:
-    camera = Stage(1.0, DepthNoise.none(), 0).intrinsics
+    camera = above_table(1.0, DepthNoise.none(), 0).intrinsics
     for pixels in (1, 7, 20):
         rows, columns = shapes.blob(np.random.default_rng(pixels), pixels, camera)
         image = np.zeros(camera.shape, bool)
@@ -107,13 +107,13 @@ def test_rods_tilt_as_far_as_they_should(tilt_max_deg: float) -> None:
 
 
 def test_only_what_is_reported_where_the_thing_stands_counts() -> None:
-    stage = Stage(1.5, DepthNoise.none(), 0)
+    stage = above_table(1.5, DepthNoise.none(), 0)
     mesh = box_mesh("box", (0.1, 0.1, 0.3))
 
     def at(x_m: float) -> Body:
         return Body("box", mesh, from_rotation_translation(np.eye(3), (x_m, 0.0, 0.15)), Owner.UNKNOWN)
 
-    voxels = stage.pipeline(FilterSettings()).process(stage.frame(at(0.3)), None)
+    voxels = stage.pipeline(FilterSettings()).process(stage.frame(at(0.3)).depth, None)
     assert reported_at(voxels, at(0.3))
     assert not reported_at(voxels, at(-0.3))
 

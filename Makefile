@@ -50,7 +50,7 @@ faults: $(READY) ## units, master, networks, clocks and disks that fail: what th
 plug-and-play: $(READY) ## four units that know nothing but a token, and what people do to them later
 	@$(BIN)/python -m qualification.plug_and_play $(ARGS)
 
-bench: $(BENCH_READY) libusb ## what Cellwatch claims, measured anew in some 20 minutes: benchmarks/REPORT.md
+bench: $(BENCH_READY) libusb ## what Cellwatch claims, measured anew in some 20 minutes: out/REPORT.md
 	@$(BIN)/python -m benchmarks.bench $(ARGS)
 
 bench-accuracy: $(READY) ## curves against ground truth, beside the paper's rule and a least number of points

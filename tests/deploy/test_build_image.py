@@ -21,6 +21,7 @@ FREE_SHARE_MAX = 0.4
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.timeout(900)
 @pytest.mark.skipif(any(shutil.which(tool) is None for tool in TOOLS), reason=f"needs {', '.join(TOOLS)}")
 def test_a_card_image_becomes_a_units_as_small_as_it_goes(roots: Path) -> None:

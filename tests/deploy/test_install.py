@@ -16,6 +16,7 @@ CHECKOUT = Path(__file__).parents[2]
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.timeout(900)
 def test_a_running_machine_becomes_master_and_unit_and_is_updated_and_taken_back(roots: Path) -> None:
     command = [*NAMESPACES, sys.executable, "-m", "tests.deploy.installing", str(roots)]

@@ -14,6 +14,7 @@ CHECKOUT = Path(__file__).parents[2]
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.timeout(1500)
 def test_machines_come_back_by_themselves_whatever_befalls_them(roots: Path) -> None:
     command = [sys.executable, "-m", "qualification.boot", "--roots", str(roots), "--no-results"]

@@ -189,6 +189,7 @@ def test_kernels_that_were_used_last_are_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.timeout(700)
 @pytest.mark.skipif(why_not() is not None, reason=f"no boards can be emulated here: {why_not()}")
 @pytest.mark.skipif(

@@ -103,6 +103,7 @@ def test_answers_are_held_against_what_stood_there(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_short_soak_is_survived(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "qualification.soak", "--seconds", "16", "--seed", "1", "--results", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=500.0, check=False)

@@ -275,7 +275,7 @@ async def _cameras(source: RealsenseSourceConfig) -> AsyncIterator[Finding]:
     except SourceError as error:
         yield Finding("FAIL", "sdk", str(error))
         return
-    yield Finding("ok", "sdk", f"RealSense SDK {found.sdk}")
+    yield Finding("ok", "sdk", f"RealSense SDK {found.sdk} with libusb of {found.libusb}")
     if source.recording is not None:
         yield Finding("ok", "camera", f"none is needed, {source.recording} is played")
         return

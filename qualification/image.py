@@ -22,9 +22,9 @@ from typing import Any
 import httpx
 
 from benchmarks.reporting.report import Mark, Result, line, write
-from qualification.machines.arm64_boards import Board, why_no_boards
+from qualification.machines.arm64_boards import EMULATOR_TOOLS, Board
 from qualification.machines.containers import BRIDGE, NAMESPACES, MachineError, confine, until
-from qualification.machines.image_parts import CACHE, CELL, build, why_not_built
+from qualification.machines.image_parts import BUILD_TOOLS, CACHE, CELL, build
 from qualification.networks import allowed, run
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, ConfigError
@@ -161,13 +161,15 @@ def boot(parts: Path, wait_s: float, document: dict[str, Any]) -> None:
             document.update(watch.document())
 
 
-def why_not() -> str | None:
-    """Why it cannot be run here, in one sentence; None where it can."""
+def why_not(building: bool = False) -> str | None:
+    """Why it cannot be run here, in one sentence that names all packages which are missing; None where it can."""
     if os.geteuid() != 0:
         return "only root may make networks and images"
     if not allowed(NAMESPACES):
         return "the kernel does not allow network, mount and process namespaces"
-    return why_no_boards()
+    tools = EMULATOR_TOOLS | (BUILD_TOOLS if building else {})
+    packages = sorted({package for command, package in tools.items() if shutil.which(command) is None})
+    return f"missing: apt-get install {' '.join(packages)}" if packages else None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -184,8 +186,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "payload_mb": None,
     }
     try:
-        reason = why_not() or (None if options.inside or options.no_build else why_not_built())
-        if reason is not None:
+        if (reason := why_not(building=not options.inside and not options.no_build)) is not None:
             raise ConfigError(reason)
         if not options.inside:
             if not options.no_build:

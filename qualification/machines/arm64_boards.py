@@ -7,7 +7,6 @@ kernel's command line which camera of the simulated cell hangs at it.
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -18,6 +17,9 @@ from qualification.networks import run
 from shared.clock import monotonic_ns
 
 COMMAND = "qemu-system-aarch64"
+
+EMULATOR_TOOLS = {COMMAND: "qemu-system-arm", "dnsmasq": "dnsmasq-base", "ip": "iproute2"}
+"""What boards and their network take, and the package that it is in."""
 
 CPU = "cortex-a76"
 """The eldest that runs kernels which were compiled for boards in common."""
@@ -98,10 +100,3 @@ class Board:
         """The end of what it wrote."""
         text = self.console.read_text(errors="replace") if self.console.exists() else ""
         return "\n".join(text.replace("\r", "").splitlines()[-TAIL_LINES:])
-
-
-def why_no_boards() -> str | None:
-    """Why none can be emulated here, in one sentence; None where they can."""
-    packages = {COMMAND: "qemu-system-arm", "dnsmasq": "dnsmasq-base"}
-    missing = {command: package for command, package in packages.items() if shutil.which(command) is None}
-    return f"missing: apt-get install {' '.join(missing.values())}" if missing else None

@@ -49,7 +49,7 @@ source: {kind: simulated, cell: /etc/cellwatch/cell/cell.yaml, cameras: 2, fps: 
 
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
 
-TOOLS = {
+BUILD_TOOLS = {
     "mmdebstrap": "mmdebstrap",
     "arch-test": "arch-test",
     "update-binfmts": "binfmt-support",
@@ -61,12 +61,6 @@ TOOLS = {
     "systemctl": "systemd",
 }
 """What building takes, and the package that it is in."""
-
-
-def why_not_built() -> str | None:
-    """Why the image cannot be built here, in one sentence; None where it can."""
-    missing = sorted({package for command, package in TOOLS.items() if shutil.which(command) is None})
-    return f"missing: apt-get install {' '.join(missing)}" if missing else None
 
 
 def state_to_compile(checkout: Path, lock: Iterable[str]) -> str:

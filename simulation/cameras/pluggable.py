@@ -14,11 +14,10 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-import pyrealsense2 as rs
-
 from edge_unit.sources.realsense import capture_link as link
 from edge_unit.sources.realsense.capture import Capture
 from edge_unit.sources.realsense.capture_process import main
+from edge_unit.sources.realsense.sdk import rs
 from shared.files import write_whole
 
 LOOK_EVERY_S = 0.02

@@ -139,7 +139,7 @@ def test_only_names_that_boards_made_of_their_own_addresses_count(
 def test_the_last_line_is_json_whatever_happened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(image_test, "why_not", lambda: "there is no QEMU here")
+    monkeypatch.setattr(image_test, "why_not", lambda building: "there is no QEMU here")
     assert main(["--parts", str(tmp_path), "--no-results"]) == 1
     out, err = capsys.readouterr()
     document = json.loads(out.splitlines()[-1])
@@ -147,6 +147,29 @@ def test_the_last_line_is_json_whatever_happened(
     assert document["machines_posting"] == document["distinct_names"] == 0
     assert {"seconds_power_on_to_first_voxel", "image_mb", "payload_mb"} <= set(document)
     assert "there is no QEMU here" in err
+
+
+def test_all_packages_that_are_missing_are_named_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.geteuid", lambda: 0)
+    monkeypatch.setattr(image_test, "allowed", lambda unshare: True)
+    monkeypatch.setenv("PATH", "")
+    packages = "dnsmasq-base iproute2 qemu-system-arm"
+    assert why_not() == f"missing: apt-get install {packages}"
+    reason = why_not(building=True) or ""
+    assert set(reason.removeprefix("missing: apt-get install ").split()) == {
+        *packages.split(),
+        *(
+            "arch-test",
+            "binfmt-support",
+            "cpio",
+            "e2fsprogs",
+            "fdisk",
+            "kmod",
+            "mmdebstrap",
+            "qemu-user-static",
+            "systemd",
+        ),
+    }
 
 
 # ---------------------------------------------------------------- kernels of an earlier run

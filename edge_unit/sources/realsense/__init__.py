@@ -3,6 +3,7 @@
 
 That process must start fast, so this page re-exports nothing. In the order of the flow:
 
+    sdk                 the RealSense SDK, and its libusb before it
     profiles            which of the pictures on offer comes nearest
     camera_clock        the camera's time stamps on our clock
     capture_link        what the capture process is asked, and what it tells

@@ -12,10 +12,10 @@ import threading
 from typing import Any
 
 import numpy as np
-import pyrealsense2 as rs
 
 from edge_unit.sources.realsense import capture_link as link
 from edge_unit.sources.realsense.devices import Devices, RecordingBroken, Unplugged, survey
+from edge_unit.sources.realsense.sdk import LIBUSB_OF, rs
 from edge_unit.sources.realsense.shared_frames import SharedFrames
 from edge_unit.sources.realsense.stream import Reading, SdkStream
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
@@ -160,6 +160,6 @@ def serve(end: socket.socket) -> None:
     received = link.receive(end)
     request = received[0] if received is not None else None
     if isinstance(request, link.Survey):
-        link.send(end, link.Found(rs.__version__, survey(context)))
+        link.send(end, link.Found(rs.__version__, LIBUSB_OF, survey(context)))
     elif isinstance(request, link.Request):
         Capture(end, request, context).run()

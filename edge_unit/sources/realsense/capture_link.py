@@ -129,9 +129,10 @@ class Failed:
 
 @dataclass(frozen=True)
 class Found:
-    """The SDK and the cameras that it sees; `devices` are dictionaries of plain values."""
+    """The SDK, whose libusb it uses, and the cameras that it sees; `devices` are dictionaries of plain values."""
 
     sdk: str
+    libusb: str
     devices: list[dict[str, Any]]
 
 

@@ -45,8 +45,8 @@ def main(descriptor: int, parent: int, serve: Callable[[socket.socket], None] = 
         pass  # whoever began this is gone
     except ImportError as error:
         text = (
-            f"the RealSense SDK cannot be loaded: {error}; it takes the packages pyrealsense2 "
-            "(pip install 'cellwatch[realsense]') and libusb-1.0 (apt-get install libusb-1.0-0)"
+            f"the RealSense SDK cannot be loaded: {error}; it takes the packages pyrealsense2 and libusb-package "
+            "(pip install 'cellwatch[realsense]'; the system's libusb will do as well: apt-get install libusb-1.0-0)"
         )
         link.send(end, link.Failed(text, final=True))
         status = 1

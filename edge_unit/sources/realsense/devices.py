@@ -11,9 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pyrealsense2 as rs
-
 from edge_unit.sources.realsense.capture_link import Request
+from edge_unit.sources.realsense.sdk import rs
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import SourceError
 

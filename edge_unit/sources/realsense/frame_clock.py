@@ -6,9 +6,8 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import Any
 
-import pyrealsense2 as rs
-
 from edge_unit.sources.realsense.camera_clock import CameraClock
+from edge_unit.sources.realsense.sdk import rs
 from shared.clock import NS_PER_MS, NS_PER_S, NS_PER_US, monotonic_ns, wall_ns
 
 COMPARE_EVERY_NS = NS_PER_S

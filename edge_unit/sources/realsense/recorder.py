@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyrealsense2 as rs
 from numpy.typing import NDArray
 
 from edge_unit.sources.realsense.capture_link import Stream
+from edge_unit.sources.realsense.sdk import rs
 from shared.errors import SourceError
 
 SUFFIX = ".db3"

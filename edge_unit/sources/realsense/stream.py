@@ -15,13 +15,13 @@ from datetime import timedelta
 from typing import Any, NamedTuple
 
 import numpy as np
-import pyrealsense2 as rs
 from numpy.typing import NDArray
 
 from edge_unit.sources.realsense.capture_link import Opened, Request
 from edge_unit.sources.realsense.devices import RecordingBroken, info_of, profiles_of, serial_of
 from edge_unit.sources.realsense.frame_clock import SdkClock
 from edge_unit.sources.realsense.profiles import Profile, choose
+from edge_unit.sources.realsense.sdk import rs
 from shared.clock import NS_PER_S, NS_PER_US, monotonic_ns
 from shared.errors import SourceEnded, SourceError
 

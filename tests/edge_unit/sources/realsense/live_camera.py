@@ -13,10 +13,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pyrealsense2 as rs
 
 from edge_unit.sources.realsense.capture_link import Request
 from edge_unit.sources.realsense.devices import Devices
+from edge_unit.sources.realsense.sdk import rs
 from edge_unit.sources.realsense.stream import SdkStream
 from shared.clock import NS_PER_MS, monotonic_ns
 from shared.errors import SourceError

@@ -30,7 +30,7 @@ MESSAGES = [
     ),
     link.Ended(),
     link.Failed("unplugged", unplugged=True),
-    link.Found("2.59.1", [{"serial": "1", "usb": "2.1"}]),
+    link.Found("2.59.1", "the system", [{"serial": "1", "usb": "2.1"}]),
 ]  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from edge_unit.pipeline.voxelizer import Voxels
 from geometry.kernels import seen as kernels
+from geometry.rendering.kernel_camera import camera_of
 from geometry.rendering.mesh_renderer import NEAR_PLANE_M
 from shared.camera import Intrinsics
 from shared.lattice import Lattice
@@ -99,12 +100,7 @@ class Visibility:
             self.lattice.voxel_size_m,
             inverse(T_world_camera),
             np.array(self.lattice.origin_m),
-            camera.fx,
-            camera.fy,
-            camera.cx,
-            camera.cy,
-            camera.width,
-            camera.height,
+            camera_of(camera),
             NEAR_PLANE_M,
             self._noise_per_m,
             camera.depth_scale_m,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.kernels.jit import kernel
-from geometry.kernels.pinhole import moved, project, rows_of
+from geometry.kernels.pinhole import Camera, moved, project, rows_of
 
 RAYS_PER_SIDE = 6
 """A block is probed by a grid of about 6 x 6 of its pixels: 5 % of them decide nothing, and it costs little."""
@@ -29,12 +29,7 @@ def block_views(
     block_size_m: float,
     T_camera_world: NDArray[np.float64],
     origin_m: NDArray[np.float64],
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    width: int,
-    height: int,
+    camera: Camera,
     near_m: float,
     noise_per_m: float,
     depth_scale_m: float,
@@ -47,6 +42,7 @@ def block_views(
     block: `blocks` its number; `views` (., 5) first and last row, first and last column, raw depth of its far corner
     plus the noise `noise_per_m * z**2` there: what stands just inside may be measured that much behind.
     """
+    camera = Camera(*camera)
     rows = rows_of(T_camera_world)
     number = 0
     for ix in range(shape[0]):
@@ -63,13 +59,13 @@ def block_views(
                     z_high = max(z_high, z)
                     if z < near_m:
                         break
-                    u, v = project(x, y, 1.0 / z, fx, fy, cx, cy)
+                    u, v = project(x, y, 1.0 / z, camera)
                     u_low, u_high = min(u_low, u), max(u_high, u)
                     v_low, v_high = min(v_low, v), max(v_high, v)
                 far_raw = math.ceil((z_high + noise_per_m * z_high * z_high) / depth_scale_m)
                 if z_low < near_m or far_raw > 65535 or u_low < 0.0 or v_low < 0.0:
                     continue
-                if u_high > width - 1 or v_high > height - 1:
+                if u_high > camera.width - 1 or v_high > camera.height - 1:
                     continue
                 blocks[number] = (ix * shape[1] + iy) * shape[2] + iz
                 views[number, 0] = math.floor(v_low)

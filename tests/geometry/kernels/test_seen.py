@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from geometry.kernels.seen import BLOCKED_MAX, RAYS_PER_SIDE, block_views, seen_blocks
+from geometry.rendering.kernel_camera import camera_of
 from shared.camera import Intrinsics
 from shared.lattice import Lattice
 from shared.transforms import Transform, apply, from_xyz_rpy, inverse, look_at
@@ -29,12 +30,7 @@ def views(
         lattice.voxel_size_m,
         inverse(T_world_camera),
         np.array(lattice.origin_m),
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
-        camera.width,
-        camera.height,
+        camera_of(camera),
         NEAR_M,
         NOISE_PER_M,
         camera.depth_scale_m,

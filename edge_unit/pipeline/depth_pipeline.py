@@ -346,10 +346,8 @@ class DepthPipeline:
         foreground.foreground_mask(
             depth_raw,
             self._room_raw,
-            self._robot.near_raw,
-            self._robot.span_raw,
-            self._robot.columns,
             self._minimum_raw,
+            self._robot.band,
             mask,
         )
         self._halo.drop(depth_raw, mask)

@@ -7,18 +7,31 @@ Limits are uint16 in the camera's own units, so that the filter compares without
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geometry.kernels.jit import kernel
-from geometry.kernels.rasterize import NOTHING_FARTHEST, NOTHING_NEAREST, span_of_row
+from geometry.kernels.rasterize import NOTHING_FARTHEST, NOTHING_NEAREST, Buffer, span_of_row
 
 RAW_MAX = 65535
 """The largest raw depth."""
 
 ZERO, ONE, TOP = np.float32(0.0), np.float32(1.0), np.float32(RAW_MAX)
 """In float32, for one float64 among them would halve what the vector unit does at once."""
+
+
+class Band(NamedTuple):
+    """The raw depths of each pixel that belong to the robot: `near_raw` and `span_raw` (H, W), lower end and length.
+
+    So stored, the filter needs one unsigned compare. Where there is no robot the band is empty: its lower end is where
+    no limit reaches. `columns` (H, 2) holds of each row the first column and the one after the last that have a band.
+    """
+
+    near_raw: NDArray[np.uint16]
+    span_raw: NDArray[np.uint16]
+    columns: NDArray[np.int32]
 
 
 @kernel
@@ -120,28 +133,23 @@ def band_of_row(
 
 @kernel
 def robot_band_raw(
-    window: NDArray[np.int64],
-    nearest_w: NDArray[np.float32],
-    farthest_w: NDArray[np.float32],
+    buffer: Buffer,
     rectangles: NDArray[np.int32],
     links: NDArray[np.bool_],
     noise_per_m: float,
     depth_m: float,
     depth_scale_m: float,
-    near_raw: NDArray[np.uint16],
-    span_raw: NDArray[np.uint16],
-    columns: NDArray[np.int32],
+    band: Band,
 ) -> None:
     """The band of raw depths in which a measurement belongs to the robot, as `rasterize.draw_meshes` has drawn it.
 
     From the nearest padded surface less its noise margin, or from 0 where the camera stands in the padding, to the
     farthest one, or `depth_m` behind the nearest if that is farther, plus the margin there: what stands behind the
-    robot is still seen. The band
-    is stored as its lower end and its length, so that the filter needs one unsigned compare. Where there is no robot
-    it is empty: its lower end is where no limit reaches. `columns` (H, 2) holds of each row the first column and the
-    one after the last that the images `near_raw` and `span_raw` (H, W) have a band in; it is renewed, and what was
-    there before is made empty.
+    robot is still seen. `band` is renewed, and what was there before is made empty.
     """
+    buffer, band = Buffer(*buffer), Band(*band)
+    window, nearest_w, farthest_w = buffer
+    near_raw, span_raw, columns = band
     noise = np.float32(noise_per_m)
     depth = np.float32(depth_m)
     units = np.float32(1.0 / depth_scale_m)
@@ -167,8 +175,9 @@ def robot_band_raw(
 
 
 @kernel
-def clear_band(near_raw: NDArray[np.uint16], span_raw: NDArray[np.uint16], columns: NDArray[np.int32]) -> None:
-    """Make the band of `robot_band_raw` empty everywhere."""
+def clear_band(band: Band) -> None:
+    """Make the band of the robot empty everywhere."""
+    near_raw, span_raw, columns = Band(*band)
     for y in range(len(near_raw)):
         empty_row(near_raw[y], span_raw[y], columns[y, 0], columns[y, 1])
         columns[y, 0], columns[y, 1] = 0, 0
@@ -184,14 +193,12 @@ def lower_row(nearest_w: NDArray[np.float32], depth_m: NDArray[np.float32]) -> N
 
 @kernel
 def lower_depth(
-    window: NDArray[np.int64],
-    nearest_w: NDArray[np.float32],
-    rectangles: NDArray[np.int32],
-    links: NDArray[np.bool_],
-    depth_m: NDArray[np.float32],
+    buffer: Buffer, rectangles: NDArray[np.int32], links: NDArray[np.bool_], depth_m: NDArray[np.float32]
 ) -> None:
     """Lower `depth_m` (H, W) to what `rasterize.draw_meshes` has drawn where that is nearer."""
+    buffer = Buffer(*buffer)
+    window = buffer.window
     for y in range(window[0], window[0] + window[2]):
         first, end = span_of_row(y, rectangles, links, links)
         at = (y - window[0]) * window[3] - window[1]
-        lower_row(nearest_w[at + first : at + end], depth_m[y, first:end])
+        lower_row(buffer.nearest_w[at + first : at + end], depth_m[y, first:end])

@@ -19,6 +19,7 @@ from edge_unit.pipeline.pose_refinement import Refiner
 from edge_unit.pipeline.visibility import SeenBlocks, Visibility
 from edge_unit.pipeline.voxelizer import Voxelizer, Voxels
 from geometry.kernels import foreground, limits
+from geometry.kernels.bundles import plain
 from geometry.rendering import Links
 from shared.camera import Intrinsics
 from shared.cell import Cell
@@ -376,12 +377,16 @@ class DepthPipeline:
             w,
             reference_m,
             spread_m,
-            settings.margin_base_m,
-            cad_noise_per_m,
-            settings.reference_margin_base_m,
-            settings.reference_spread_gain,
-            settings.range_max_m,
-            camera.depth_scale_m,
+            plain(
+                limits.Margins(
+                    settings.margin_base_m,
+                    cad_noise_per_m,
+                    settings.reference_margin_base_m,
+                    settings.reference_spread_gain,
+                    settings.range_max_m,
+                    camera.depth_scale_m,
+                )
+            ),
             raw,
         )
         radius_px = round(settings.edge_radius_px * camera.width / EDGE_RADIUS_WIDTH_PX)

@@ -22,6 +22,21 @@ ZERO, ONE, TOP = np.float32(0.0), np.float32(1.0), np.float32(RAW_MAX)
 """In float32, for one float64 among them would halve what the vector unit does at once."""
 
 
+class Margins(NamedTuple):
+    """By how much a limit lies before what is expected.
+
+    Before a CAD surface `cad_base_m` and `cad_noise_per_m * z**2`, before a learned one `reference_base_m` and its
+    spread times `reference_gain`; at `range_max_m` where neither is known.
+    """
+
+    cad_base_m: float
+    cad_noise_per_m: float
+    reference_base_m: float
+    reference_gain: float
+    range_max_m: float
+    depth_scale_m: float
+
+
 class Band(NamedTuple):
     """The raw depths of each pixel that belong to the robot: `near_raw` and `span_raw` (H, W), lower end and length.
 
@@ -49,20 +64,15 @@ def static_limit_raw(
     cad_w: NDArray[np.float32],
     reference_m: NDArray[np.float32],
     spread_m: NDArray[np.float32],
-    cad_base_m: float,
-    cad_noise_per_m: float,
-    reference_base_m: float,
-    reference_gain: float,
-    range_max_m: float,
-    depth_scale_m: float,
+    margins: Margins,
     limit_raw: NDArray[np.uint16],
 ) -> None:
     """Per pixel, the raw depth at which what is measured is no longer nearer than all that stands still.
 
-    The nearer of the CAD surface, less `base + noise * z**2` with `cad_w` = 1/z (H, W), and the learned surface,
-    less `base + gain * spread` with `reference_m`, `spread_m` (H, W), NaN where nothing was learned;
-    `range_max_m` where neither is known. Out: `limit_raw` (H, W), rounded down.
+    The nearer of the CAD surface, `cad_w` = 1/z (H, W), and the learned surface, `reference_m` and `spread_m` (H, W),
+    NaN where nothing was learned, each less its margin. Out: `limit_raw` (H, W), rounded down.
     """
+    cad_base_m, cad_noise_per_m, reference_base_m, reference_gain, range_max_m, depth_scale_m = Margins(*margins)
     height, width = limit_raw.shape
     for y in range(height):
         for x in range(width):

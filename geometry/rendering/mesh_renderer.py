@@ -133,10 +133,17 @@ class LinkDrawing:
         self._kept = DepthBuffer(intrinsics, farthest)
         self._is_kept = np.zeros(self._batch.count, np.bool_)
         self._is_drawn = np.zeros(self._batch.count, np.bool_)
-        self._still_for = np.zeros(self._batch.count, np.int64)
-        # Nowhere yet.
-        self._poses = np.full((self._batch.count, 4, 4), np.nan)
-        self._padding_m = np.zeros(self._batch.count, np.float32)
+        self._stillness = plain(motion.Stillness(STILL_M, KEPT_AFTER))
+        self._drawn = plain(
+            motion.Drawn(
+                # Nowhere yet.
+                poses=np.full((self._batch.count, 4, 4), np.nan),
+                padding_m=np.zeros(self._batch.count, np.float32),
+                still_for=np.zeros(self._batch.count, np.int64),
+                is_kept=self._is_kept,
+                is_drawn=self._is_drawn,
+            )
+        )
 
     @property
     def rectangles(self) -> NDArray[np.int32]:
@@ -157,14 +164,9 @@ class LinkDrawing:
             T_camera_link,
             padding_m,
             self._reach_m,
-            STILL_M,
-            KEPT_AFTER,
+            self._stillness,
             anew,
-            self._poses,
-            self._padding_m,
-            self._still_for,
-            self._is_kept,
-            self._is_drawn,
+            self._drawn,
         )
         if found == motion.STILL:
             return False

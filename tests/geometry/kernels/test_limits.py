@@ -37,9 +37,9 @@ def static_twin(
     return np.clip(limit_m / scale_m, 0.0, RAW_MAX)
 
 
-def static_limit(*arguments: Any) -> NDArray[np.uint16]:
-    out = np.full(np.shape(arguments[0]), 123, np.uint16)
-    static_limit_raw(*arguments, out)
+def static_limit(w: Any, reference_m: Any, spread_m: Any, *figures: float) -> NDArray[np.uint16]:
+    out = np.full(np.shape(w), 123, np.uint16)
+    static_limit_raw(w, reference_m, spread_m, plain(limits.Margins(*figures)), out)
     return out
 
 

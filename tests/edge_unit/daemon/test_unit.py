@@ -596,7 +596,7 @@ async def test_at_the_end_of_a_recording_the_last_frame_is_merged(tmp_path: Path
     assert last.sent
     assert last.merged_at_ns is not None
     assert 0 < last.merged_at_ns - last.captured_at_ns < 10**10
-    stages = ["source", "joints", "thread", "robot", "filter", "density", "check", "report"]
+    stages = ["source", "joints", "thread", "robot", "filter", "density", "seen", "health", "check", "report"]
     assert list(last.stages_ns) == stages
     assert all(took_ns >= 0 for took_ns in last.stages_ns.values())
     assert last.sent_at_ns is not None

@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-accuracy bench-pipeline bench-board bench-master bench-scale bench-latency soak bench-pose-monitor bench-paper viewer-test rehearsal image-test pictures test lint clean
+.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-accuracy bench-pipeline bench-board bench-master bench-scale bench-latency soak bench-pose-monitor bench-paper viewer-test rehearsal image-test fresh-machine pictures test lint clean
 
 ARGS ?=
 MINUTES ?= 30
@@ -88,6 +88,9 @@ rehearsal: $(READY) ## a master and three units as machines that boot from what 
 
 image-test: $(READY) ## two arm64 boards boot from one image, find a master and report to it (root, QEMU)
 	@$(BIN)/python -m qualification.image $(ARGS)
+
+fresh-machine: $(READY) ## demo and test on Debians that have only Python, its venv and make (root, mmdebstrap)
+	@$(BIN)/python -m qualification.fresh_machine $(ARGS)
 
 pictures: $(READY) ## the pictures of the README, painted anew
 	@$(BIN)/python -m simulation.demo.picture assets/pictures/demo.png

@@ -102,15 +102,12 @@ test: $(READY) lint ## lint, then all tests but the slow ones; with SLOW=1 these
 	$(PYTEST) -m "alone$(if $(SLOW),, and not slow)" $(ARGS) || [ $$? -eq $(NO_TESTS) ] || failed=1; \
 	exit $$failed
 
-# JetPack 6 has Python 3.10: a second look sees what that has not. numpy's types are written for later ones, so there
-# they are partly unknown, and what is told of that kind is left to the first look. Each has a cache of its own.
 lint: $(READY) ## ruff, and mypy for this Python and for 3.10
 	@failed=0; \
 	$(BIN)/ruff check -q . || failed=1; \
 	$(BIN)/ruff format -q --check . || failed=1; \
 	$(if $(TYPED),$(BIN)/mypy --no-error-summary $(TYPED) || failed=1; \
-	$(BIN)/mypy --no-error-summary --python-version 3.10 --cache-dir .mypy_cache/py310 \
-	    --no-warn-return-any --no-warn-unused-ignores $(TYPED) || failed=1;) \
+	$(BIN)/mypy --no-error-summary --config-file scripts/mypy-3.10.ini $(TYPED) || failed=1;) \
 	exit $$failed
 
 clean: ## takes out .venv and all caches

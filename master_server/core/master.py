@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from master_server.cells.published import PublishedCell
-from master_server.core.coverage import Coverage, blocks_of
+from master_server.core.coverage import Coverage
 from master_server.core.merged_map import NO_KEYS, MergedMap
 from master_server.core.robot_joints import RobotJoints
 from master_server.core.units import Registry, Slot
@@ -102,7 +102,7 @@ class Master:
         self.robot = RobotJoints(cell.robot.joint_names if cell.robot else None)
         self.listeners: list[Callable[[], None]] = []
         """Called after each change of what `view` says; time alone changes it too, see `next_change_ns`."""
-        self._begin_on(lattice, blocks_of(cell, settings.seen_block_size_m))
+        self._begin_on(lattice, cell.blocks(settings.seen_block_size_m))
 
     @property
     def cell(self) -> Cell:
@@ -323,7 +323,7 @@ class Master:
         if settings == self.settings:
             return settings
         lattice = self.cell.lattice(settings.voxel_size_m)
-        blocks = blocks_of(self.cell, settings.seen_block_size_m)
+        blocks = self.cell.blocks(settings.seen_block_size_m)
         lattice_changes = lattice != self.lattice
         versions = Versions(
             settings=self.versions.settings + 1,
@@ -350,7 +350,7 @@ class Master:
         """
         published = cell if isinstance(cell, PublishedCell) else PublishedCell.of(cell)
         lattice = published.cell.lattice(self.settings.voxel_size_m)
-        blocks = blocks_of(published.cell, self.settings.seen_block_size_m)
+        blocks = published.cell.blocks(self.settings.seen_block_size_m)
         if published.reference == self.published.reference:
             return self.cell_answer
         versions = self.versions.model_copy(

@@ -476,7 +476,7 @@ def test_settings_that_are_refused_change_nothing(monkeypatch: pytest.MonkeyPatc
     def refuse(*_: Any) -> Lattice:
         raise InputError("no such blocks")
 
-    monkeypatch.setattr("master_server.core.master.blocks_of", refuse)
+    monkeypatch.setattr(Cell, "blocks", refuse)
     with pytest.raises(InputError):
         one.change_settings({"voxel_size_m": 0.04, "seen_block_size_m": 0.05})
     assert (one.settings, one.versions, one.lattice, one.coverage.blocks) == before

@@ -23,7 +23,7 @@ from master_server.api.routes.common import ip_of, log_refusal, refused
 from master_server.api.routes.replay import RefusedUpdate
 from master_server.api.routes.update import UpdateEndpoint
 from master_server.cells.cell_loading import CellLoader
-from master_server.core import Master, Readable, ReadableCell
+from master_server.core import Master, Readable, ReadableCell, Ticker
 from master_server.recording.recorder import Recorder
 from master_server.recording.replay import Replay
 from master_server.security import Access, Limits
@@ -101,7 +101,7 @@ def make_app(
 ) -> Application:
     """The application that serves one master; `limits` are shared with what holds its connections."""
     routers = [module.router for module in (units, images, cell, map, stream, robot, recording, health)]
-    app = _assembled(Application, master, access, routers, recorder, limits, master.store.follow)
+    app = _assembled(Application, master, access, routers, recorder, limits, Ticker(master), master.store.follow)
     app.state.loader = CellLoader()
     app.state.pictures = Pictures(master.registry)
     app.state.metrics = metrics = Metrics(master, app.state.stream, app.state.limits)
@@ -135,6 +135,7 @@ def _assembled(
     routers: list[APIRouter],
     recorder: Recorder | None,
     limits: Limits | None,
+    ticker: Ticker | None = None,
     *beside: Callable[[], Coroutine[None, None, None]],
 ) -> Application:
     listeners = Stream(master)
@@ -144,7 +145,8 @@ def _assembled(
     async def running(app: FastAPI) -> AsyncIterator[None]:
         # Now, while nobody waits for it.
         app.openapi()
-        listeners.start()
+        if ticker is not None:
+            ticker.start()
         tasks = [asyncio.create_task(work()) for work in (access.follow, history.follow, *beside)]
         if recorder is not None and recorder.enabled:
             await recorder.begin()
@@ -153,6 +155,8 @@ def _assembled(
         finally:
             for task in tasks:
                 task.cancel()
+            if ticker is not None:
+                ticker.stop()
             listeners.stop()
             if app.state.viewer is not None:
                 await app.state.viewer.host.close()

@@ -126,7 +126,7 @@ class Master:
         self._changed()
         return InitializeAnswer(
             id=slot.id,
-            session=slot.session,
+            session=slot.session.number,
             versions=self._versions_for(slot),
             settings=self.settings,
             lattice=self.lattice_description,
@@ -146,28 +146,34 @@ class Master:
             WireError: keys or seen report are malformed; nothing was changed.
         """
         slot = self.registry.own(update.id, ip)
-        if update.session != slot.session:
+        if update.session != slot.session.number:
             raise Refusal(409, f"unit {slot.id}: this session is over, initialize again")
-        if update.sequence <= slot.sequence:
-            raise Refusal(409, f"unit {slot.id}: expected a sequence above {slot.sequence}, got {update.sequence}")
+        before = slot.session.sequence
+        if update.sequence <= before:
+            raise Refusal(409, f"unit {slot.id}: expected a sequence above {before}, got {update.sequence}")
         on_lattice = update.versions.lattice == self.versions.lattice
         keys = keys_from_bytes(update.keys, self.lattice.cell_count) if on_lattice else NO_KEYS
         if update.seen is not None and update.versions == self._versions_for(slot):
             self.coverage.report(slot.id, update.seen)
-        self._take_in(slot, update, keys, now_ns)
-        if self.judge(slot, now_ns)[0] == "live":
-            self.map.replace(slot.id, keys)
-        else:
-            self.map.withdraw(slot.id)
+        self.map.replace(slot.id, keys)
+        slot.session.take_in(update, now_ns)
+        for outcome in update.done:
+            slot.end(outcome)
+        self._notice(slot, now_ns)
         self._changed()
         return self._answer(slot, update, now_ns)
 
     def judge(self, slot: Slot, now_ns: int) -> tuple[State, str]:
-        """A unit's state now, and why in words; a state other than the last one found is logged."""
-        state, reason = slot.judge(now_ns, self.versions, self.settings)
-        if state != slot.told_state:
-            slot.tell(state, reason)
-        return state, reason
+        """A unit's state now, and why in words."""
+        return slot.judge(now_ns, self.versions, self.settings)
+
+    def tick(self, now_ns: int) -> None:
+        """Notice what time alone changed: log units whose state is another one, end commands that were not answered.
+
+        No answer waits for it: each is of its own `now_ns`.
+        """
+        for slot in self.registry:
+            self._notice(slot, now_ns)
 
     def units(self, now_ns: int) -> list[UnitRow]:
         """One row a unit."""
@@ -175,7 +181,9 @@ class Master:
         for slot in self.registry:
             pose = slot.T_world_camera
             range_m = None if pose is None else self.coverage.range_m(slot.id, pose)
-            rows.append(slot.row(now_ns, *self.judge(slot, now_ns), None if range_m is None else round(range_m, 2)))
+            voxels = len(self.map.keys_of(slot.id))
+            range_m = None if range_m is None else round(range_m, 2)
+            rows.append(slot.row(now_ns, *self.judge(slot, now_ns), voxels, range_m))
         return rows
 
     def unit_states(self, now_ns: int) -> list[dict[str, Any]]:
@@ -183,7 +191,7 @@ class Master:
         rows = []
         for slot in self.registry:
             state, reason = self.judge(slot, now_ns)
-            age_s = slot.age_s(now_ns)
+            age_s = slot.session.age_s(now_ns)
             rows.append(
                 {
                     "id": slot.id,
@@ -191,7 +199,7 @@ class Master:
                     "state": state,
                     "reason": reason,
                     "age_s": None if age_s is None else round(age_s, 4),
-                    "voxels": len(slot.keys),
+                    "voxels": len(self.map.keys_of(slot.id)),
                 }
             )
         return rows
@@ -240,16 +248,17 @@ class Master:
 
     def view(self, now_ns: int) -> MapView:
         """The union of what live units report, and what it lacks (Algorithm 9)."""
-        reasons = []
-        ages_s = []
+        reasons: list[str] = []
+        live: list[int] = []
+        oldest_s: float | None = None
         for slot in self.registry:
             state, reason = self.judge(slot, now_ns)
             if state != "live":
-                self.map.withdraw(slot.id)
                 reasons.append(f"unit {slot.id} ({slot.ip}) is {state}: {reason}")
                 continue
-            self.map.replace(slot.id, slot.keys)
-            ages_s.append(slot.age_s(now_ns) or 0.0)
+            live.append(slot.id)
+            age_s = slot.session.age_s(now_ns) or 0.0
+            oldest_s = age_s if oldest_s is None else max(oldest_s, age_s)
             if not self.coverage.has(slot.id):
                 reasons.append(f"unit {slot.id} ({slot.ip}) has not reported what it looks through")
         if not len(self.registry):
@@ -257,16 +266,16 @@ class Master:
         robot_state, robot_reason = self.robot.state(now_ns, self.settings.robot_stale_after_s)
         if robot_state not in ("fresh", "none"):
             reasons.append(robot_reason)
-        keys, witnesses = self.map.voxels()
+        keys, witnesses = self.map.voxels(live)
         return MapView(
             self.lattice,
             self.versions.lattice,
             keys,
             witnesses,
             tuple(reasons),
-            max(ages_s, default=None),
-            len(ages_s),
-            self.map.reports(),
+            oldest_s,
+            len(live),
+            self.map.reports(live),
         )
 
     def seen_by(self, now_ns: int) -> NDArray[np.uint8]:
@@ -279,7 +288,7 @@ class Master:
 
     def next_change_ns(self, now_ns: int) -> int | None:
         """The time after which a unit or the robot is stale if it stays silent; the first of them, None without any."""
-        moments = [slot.expires_at_ns(self.settings.stale_after_s) for slot in self.registry]
+        moments = [slot.session.expires_at_ns(self.settings.stale_after_s) for slot in self.registry]
         moments.append(self.robot.expires_at_ns(self.settings.robot_stale_after_s))
         return min((moment for moment in moments if moment is not None and moment >= now_ns), default=None)
 
@@ -399,29 +408,17 @@ class Master:
         self.lattice_description = LatticeDescription.of(self.lattice)
         self.map = MergedMap(self.lattice)
         self.coverage = Coverage(blocks)
-        for slot in self.registry:
-            slot.keys = NO_KEYS
 
     def _withdraw(self, unit_id: int) -> None:
         self.map.withdraw(unit_id)
         self.coverage.withdraw(unit_id)
 
-    def _take_in(self, slot: Slot, update: UpdateRequest, keys: NDArray[np.uint32], now_ns: int) -> None:
-        slot.sequence = update.sequence
-        slot.arrived_at_ns = now_ns
-        slot.versions = update.versions
-        slot.health = update.health
-        slot.phase = update.phase
-        slot.keys = keys
-        if update.exchange is not None:
-            slot.clock.add(update.exchange)
-        if update.captured_at_ns != slot.captured_at_ns and update.captured_at_ns is not None:
-            slot.captures_ns.append(update.captured_at_ns)
-        slot.captured_at_ns = update.captured_at_ns
-        for outcome in update.done:
-            slot.end(outcome)
+    def _notice(self, slot: Slot, now_ns: int) -> None:
         if slot.asked:
             slot.expire(now_ns)
+        state, reason = self.judge(slot, now_ns)
+        if state != slot.told_state:
+            slot.tell(state, reason)
 
     def _answer(self, slot: Slot, update: UpdateRequest, now_ns: int) -> UpdateAnswer:
         current, theirs = self._versions_for(slot), update.versions

@@ -246,7 +246,7 @@ def _serve(
         ready,
         config.ready_file,
         config.host,
-        lambda: _status(app.state.master, ready["url"]),
+        lambda: _status(app.services.master, ready["url"]),
         Announcer(lambda: says(sha256), listens_at, port) if says is not None else None,
         gate,
     )

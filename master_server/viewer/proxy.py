@@ -146,7 +146,7 @@ def _read_page() -> bytes:
 
 
 def _gate(connection: HTTPConnection) -> Gate:
-    gate = connection.app.state.viewer
+    gate = connection.app.gate
     assert isinstance(gate, Gate)
     return gate
 

@@ -75,7 +75,7 @@ def corpus(unit: FakeUnit) -> list[bytes]:
 
 def known_of(desk: Desk, unit: FakeUnit) -> tuple[Any, ...]:
     """All that the master knows of one unit, but for how old it is."""
-    state = desk.app.state.master
+    state = desk.app.services.master
     slot = next(slot for slot in state.registry if slot.id == unit.initialized.id)
     keys, _ = state.map.voxels()
     reported, session = state.map.keys_of(slot.id).tolist(), slot.session

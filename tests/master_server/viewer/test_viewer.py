@@ -266,7 +266,7 @@ async def test_the_last_minutes_are_there_for_who_asks() -> None:
     app = make_app(watched, Access(UNIT, OPERATOR))
     joined(watched, 1).update(START_NS, [3], seen=sees_all(watched))
     for number in range(SAMPLES_MAX + 5):
-        app.state.history.take(START_NS + number * S // 1000)
+        app.services.history.take(START_NS + number * S // 1000)
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://master:8420") as client:
         assert (await client.get("/history")).status_code == 401
         answer = await client.get("/history", headers={"Authorization": f"Bearer {UNIT.decode()}"})

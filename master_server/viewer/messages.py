@@ -11,7 +11,6 @@ from master_server.api.history import Sample
 from master_server.core.robot_joints import RobotState
 from master_server.recording.replay import ReplayAnswer
 from master_server.viewer.sessions import Viewer
-from shared.lattice import Lattice
 from shared.messages import LatticeDescription, UnitRow
 
 NOT_RECORDED: dict[int, bytes] = {}
@@ -106,22 +105,42 @@ class SeenBits(ViewerMessage):
     blocks: LatticeDescription
 
 
+class MapBits(ViewerMessage):
+    """The merged map: all that the picture of the obstacles is made of.
+
+    Attributes:
+        keys: little-endian uint32 (N,), ascending.
+        witnesses: uint8 (N,).
+        reports: keys of each live unit as in `keys`, by its id; None where nobody asked for them.
+    """
+
+    lattice: LatticeDescription
+    keys: bytes
+    witnesses: bytes
+    reports: dict[int, bytes] | None = None
+
+    @property
+    def count(self) -> int:
+        """How many voxels there are."""
+        return len(self.witnesses)
+
+    @property
+    def tells_who(self) -> bool:
+        """Whether it is known which unit reports a voxel, if there is any."""
+        return not self.keys or self.reports != NOT_RECORDED
+
+
 class Look(ViewerMessage):
     """The map and the robot at one time, and what else was wanted: None where it was not.
 
     Attributes:
         cell: the sha256 of the watched cell's document.
-        keys: little-endian uint32 (N,), ascending.
-        witnesses: uint8 (N,).
         reasons: the first few, why the map is not complete; `reason_count` are all.
-        reports: keys of each live unit as in `keys`, by its id.
     """
 
     now_ns: int
     cell: str
-    lattice: LatticeDescription
-    keys: bytes
-    witnesses: bytes
+    map: MapBits
     reasons: tuple[str, ...]
     reason_count: int
     oldest_view_age_s: float | None
@@ -130,20 +149,5 @@ class Look(ViewerMessage):
     joints: tuple[float, ...] | None
     units: tuple[UnitRow, ...] | None = None
     history: tuple[Sample, ...] = ()
-    reports: dict[int, bytes] | None = None
     seen: SeenBits | None = None
     replay: ReplayAnswer | None = None
-
-    @property
-    def drawn(self) -> tuple[bytes, bytes, LatticeDescription, dict[int, bytes] | None]:
-        """All that the picture of the obstacles is made of."""
-        return self.keys, self.witnesses, self.lattice, self.reports
-
-    @property
-    def tells_who(self) -> bool:
-        """Whether it is known which unit reports a voxel, if there is any."""
-        return not self.keys or self.reports != NOT_RECORDED
-
-    def map_lattice(self) -> Lattice:
-        """The lattice of the map."""
-        return self.lattice.lattice()

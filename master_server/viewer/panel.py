@@ -106,7 +106,7 @@ def status_html(told: Look) -> str:
             f"<b>recording</b> {html.escape(replayed.file)}, {replayed.position_s:.1f} of "
             f"{replayed.duration_s:.1f} s{_of_files(replayed.files)}, {state}"
         )
-    voxels = len(told.keys) // 4
+    voxels = told.map.count
     age_s = told.oldest_view_age_s
     age = "" if age_s is None else f", oldest view {age_s * 1000:.0f} ms"
     units = f"{told.units_live} unit{'' if told.units_live == 1 else 's'} live"
@@ -356,7 +356,7 @@ class Person:
         if units.keys() != self._units.keys():
             self._unit.options = tuple(units) or ("none",)
         self._units = units
-        self._legend.content = legend_html(self.wants_by_unit, [row.id for row in rows], told.tells_who)
+        self._legend.content = legend_html(self.wants_by_unit, [row.id for row in rows], told.map.tells_who)
         if self._wants_ranges.value:
             self._ranges.show(rows)
         else:

@@ -8,7 +8,7 @@ import numpy as np
 from master_server.api.history import History
 from master_server.core import Readable
 from master_server.recording.replay import Replay
-from master_server.viewer.messages import Look, LookRequest, RobotStanding, SeenBits
+from master_server.viewer.messages import Look, LookRequest, MapBits, RobotStanding, SeenBits
 from shared.messages import LatticeDescription
 
 REASONS_MAX = 8
@@ -30,9 +30,12 @@ def look(master: Readable, history: History, wanted: LookRequest, now_ns: int) -
     return Look(
         now_ns=now_ns,
         cell=master.published.reference.sha256,
-        lattice=LatticeDescription.of(view.lattice),
-        keys=view.keys.tobytes(),
-        witnesses=view.witnesses.tobytes(),
+        map=MapBits(
+            lattice=LatticeDescription.of(view.lattice),
+            keys=view.keys.tobytes(),
+            witnesses=view.witnesses.tobytes(),
+            reports={unit_id: keys.tobytes() for unit_id, keys in view.reports.items()} if wanted.reports else None,
+        ),
         reasons=view.reasons[:REASONS_MAX],
         reason_count=len(view.reasons),
         oldest_view_age_s=view.oldest_view_age_s,
@@ -41,7 +44,6 @@ def look(master: Readable, history: History, wanted: LookRequest, now_ns: int) -
         joints=robot.joints[-1].positions if robot.joints else None,
         units=tuple(master.units(now_ns)) if wanted.units else None,
         history=tuple(history.since(wanted.since_ns)) if wanted.units else (),
-        reports={unit_id: keys.tobytes() for unit_id, keys in view.reports.items()} if wanted.reports else None,
         seen=seen,
         replay=master.answer(now_ns) if isinstance(master, Replay) else None,
     )

@@ -22,6 +22,7 @@ from master_server.viewer.messages import (
     BeginRequest,
     Look,
     LookRequest,
+    MapBits,
     ReadyAnswer,
     ReadyRequest,
 )
@@ -59,7 +60,7 @@ class Window:
         self._somebody_came = threading.Event()
         self._cell: Cell | None = None
         self._cell_sha256 = ""
-        self._drawn: tuple[object, ...] = ()
+        self._drawn: MapBits | None = None
         self._voxels: Voxels | None = None
         self.server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         # Nobody opens a tunnel to the world from here; the master does not pass such requests on, either.
@@ -131,8 +132,8 @@ class Window:
         if told.cell != self._cell_sha256:
             self._load_cell(told.cell)
         self._scene.set_joints(told.joints)
-        if told.drawn != self._drawn:
-            self._drawn, self._voxels = told.drawn, voxels_of(told)
+        if told.map != self._drawn:
+            self._drawn, self._voxels = told.map, voxels_of(told.map)
         assert self._voxels is not None
         for person in people:
             person.draw(self._voxels)
@@ -150,7 +151,7 @@ class Window:
         }
         cell = Cell.from_document(document, meshes, self._cell)
         self._scene.set_cell(cell)
-        self._cell, self._cell_sha256, self._drawn = cell, sha256, ()
+        self._cell, self._cell_sha256, self._drawn = cell, sha256, None
 
     def _get(self, path: str) -> bytes:
         answer = self._asker.ask(ApiRequest(method="GET", path=path, viewer=Viewer.READER), ApiAnswer)
@@ -162,11 +163,11 @@ class Window:
         threading.Event().wait(max(seconds, 0.0))
 
 
-def voxels_of(told: Look) -> Voxels:
-    """The obstacles of a look."""
+def voxels_of(told: MapBits) -> Voxels:
+    """The obstacles of a map."""
     reports = {unit_id: np.frombuffer(keys, np.uint32) for unit_id, keys in (told.reports or {}).items()}
     keys, witnesses = np.frombuffer(told.keys, np.uint32), np.frombuffer(told.witnesses, np.uint8)
-    return Voxels.of(told.map_lattice(), keys, witnesses, reports)
+    return Voxels.of(told.lattice.lattice(), keys, witnesses, reports)
 
 
 def _named_meshes(document: dict[str, Any]) -> set[str]:

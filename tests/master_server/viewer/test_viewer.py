@@ -206,7 +206,7 @@ def test_a_look_tells_what_is_drawn() -> None:
     history.take(START_NS)
     told = told_of(watched, history, LookRequest(units=True, unseen=True, since_ns=START_NS - S))
     assert told.history == (Sample(START_NS, None, 0, 0, False),)
-    assert told.map_lattice() == watched.lattice
+    assert told.map.lattice.lattice() == watched.lattice
     assert told.seen is not None
     assert told.seen.blocks.lattice() == watched.coverage.blocks
     assert len(told.seen.bits) == -(-watched.coverage.blocks.cell_count // 8)
@@ -216,7 +216,7 @@ def test_a_look_tells_what_is_drawn() -> None:
     assert told.units == ()
     assert "No unit has registered yet" in table_html(told.units)
     least = told_of(watched, history, LookRequest())
-    assert (least.units, least.history, least.reports, least.seen) == (None, (), None, None)
+    assert (least.units, least.history, least.map.reports, least.seen) == (None, (), None, None)
 
 
 def told_of(watched: Master, history: History, wanted: LookRequest, now_ns: int = START_NS) -> Look:
@@ -237,13 +237,13 @@ def test_colours_tell_how_many_or_who() -> None:
     for number, keys in ((1, [3, 4]), (2, [4, 5])):
         joined(watched, number).update(START_NS, keys, seen=sees_all(watched))
     history = History(watched)
-    voxels = voxels_of(told_of(watched, history, LookRequest(reports=True)))
+    voxels = voxels_of(told_of(watched, history, LookRequest(reports=True)).map)
     assert voxels.owners.tolist() == [1, 0, 2]
     assert voxels.colours(by_unit=False).tolist() == linear([WITNESS_COLOURS[i] for i in (0, 1, 0)]).tolist()
     expected = linear([unit_colour(1), SHARED_COLOUR, unit_colour(2)])
     assert voxels.colours(by_unit=True).tolist() == expected.tolist()
     # Nobody asked who reports them.
-    assert voxels_of(told_of(watched, history, LookRequest())).owners.tolist() == [0, 0, 0]
+    assert voxels_of(told_of(watched, history, LookRequest()).map).owners.tolist() == [0, 0, 0]
 
 
 def test_what_is_linear_is_shown_as_meant() -> None:

@@ -13,7 +13,7 @@ import logging
 from typing import Any, Literal, NamedTuple
 
 from master_server.api.responses import Form, as_json, as_msgpack, map_fields, unseen_fields
-from master_server.core import MapView, Readable
+from master_server.core import MapView, Readable, UnitState
 from shared.clock import NS_PER_MS, stage_ns
 from shared.errors import Refusal
 from shared.waiting import Clock, LoopClock, Timer
@@ -52,7 +52,7 @@ class Picture:
         number: int,
         now_ns: int,
         view: MapView,
-        units: list[dict[str, Any]],
+        units: list[UnitState],
         unseen: dict[str, Any] | None,
     ) -> None:
         self.number = number

@@ -17,7 +17,7 @@ from master_server.core.merged_map import MergedMap
 from master_server.core.read_model import Readable, ReadableCell
 from master_server.core.robot_joints import RobotJoints
 from master_server.core.ticker import Ticker
-from master_server.core.units import Registry
+from master_server.core.units import Registry, UnitState
 
 __all__ = [
     "MapView",
@@ -28,4 +28,5 @@ __all__ = [
     "Registry",
     "RobotJoints",
     "Ticker",
+    "UnitState",
 ]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from master_server.cells.published import PublishedCell
 from master_server.core.coverage import Coverage
 from master_server.core.merged_map import NO_KEYS, MergedMap
 from master_server.core.robot_joints import RobotJoints
-from master_server.core.units import Registry, Slot
+from master_server.core.units import Registry, Slot, UnitState
 from master_server.persistence import Store, beginning
 from shared.cell import Cell
 from shared.configuration import sentence
@@ -186,22 +185,14 @@ class Master:
             rows.append(slot.row(now_ns, *self.judge(slot, now_ns), voxels, range_m))
         return rows
 
-    def unit_states(self, now_ns: int) -> list[dict[str, Any]]:
-        """Of each row what a stream tells at every change: id, ip, state, reason, age and voxels."""
+    def unit_states(self, now_ns: int) -> list[UnitState]:
+        """Of each row what a stream tells at every change."""
         rows = []
         for slot in self.registry:
             state, reason = self.judge(slot, now_ns)
             age_s = slot.session.age_s(now_ns)
-            rows.append(
-                {
-                    "id": slot.id,
-                    "ip": slot.ip,
-                    "state": state,
-                    "reason": reason,
-                    "age_s": None if age_s is None else round(age_s, 4),
-                    "voxels": len(self.map.keys_of(slot.id)),
-                }
-            )
+            voxels = len(self.map.keys_of(slot.id))
+            rows.append(UnitState(slot.id, slot.ip, state, reason, None if age_s is None else round(age_s, 4), voxels))
         return rows
 
     def forget(self, unit_id: int) -> None:
@@ -318,7 +309,7 @@ class Master:
 
     # ------------------------------------------------------------------ what an operator changes
 
-    def change_settings(self, changes: dict[str, Any]) -> Settings:
+    def change_settings(self, changes: Mapping[str, object]) -> Settings:
         """Change some settings; the others stay. Every unit has them with the answer to its next update.
 
         Raises:
@@ -431,7 +422,7 @@ class Master:
         )
         if current == theirs:
             return answer
-        changed: dict[str, Any] = {}
+        changed: dict[str, object] = {}
         if current.settings != theirs.settings or current.lattice != theirs.lattice:
             changed |= {"settings": self.settings, "lattice": self.lattice_description}
         if current.cell != theirs.cell:

@@ -9,8 +9,10 @@ import secrets
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
+from pydantic import ConfigDict, Field
 
 from master_server.core.merged_map import MAX_WITNESSES
 from master_server.persistence import Store, UnitRecord
@@ -71,6 +73,21 @@ TOLD_ORIGINS = ("configured", "source")
 
 IMAGE_EXPIRES_S = 5.0
 """The unit needs one frame and one update for it; whoever waits in front of a browser has lost patience by then."""
+
+
+@dataclass(frozen=True)
+class UnitState:
+    """One unit in a message of the stream."""
+
+    # Readers pass over what a later master tells besides, also within a message that forbids it.
+    __pydantic_config__ = ConfigDict(extra="ignore")
+
+    id: int
+    ip: str
+    state: State
+    reason: str
+    age_s: Annotated[float | None, Field(description="Since the capture of its last frame.")]
+    voxels: int
 
 
 @dataclass

@@ -553,8 +553,8 @@ def test_who_asks_changes_and_logs_nothing(caplog: pytest.LogCaptureFixture) -> 
         )
         assert one.seen_by(now_ns).any() == bool(expected)
         (row,), (told,) = one.units(now_ns), one.unit_states(now_ns)
-        assert row.state == told["state"] == ("live" if expected else "stale")
-        assert row.voxels == told["voxels"] == 1
+        assert row.state == told.state == ("live" if expected else "stale")
+        assert row.voxels == told.voxels == 1
         assert row.last_command is not None
         assert (row.last_command.outcome is None) == bool(expected)
         one.next_change_ns(now_ns)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from edge_unit.joints import DelayWatch, JointEstimate
 from edge_unit.pipeline import DepthPipeline
-from edge_unit.pipeline.depth_pipeline import EXACT
+from edge_unit.pipeline.moving_model import EXACT
 from edge_unit.sources.frame import DepthFrame
 from edge_unit.uplink.uplink import Assignment, Uplink
 from shared.clock import NS_PER_S

@@ -73,11 +73,16 @@ class Visibility:
         box_min_m: NDArray[np.float64],
         box_max_m: NDArray[np.float64],
         block_size_m: float,
+        share_min: float,
         noise_per_m: float,
     ) -> None:
-        """`noise_per_m` is the `c` of the camera's `sigma(z) = c * z**2`."""
+        """A block is seen where at least `share_min` of its rays pass through it.
+
+        `noise_per_m` is the `c` of the camera's `sigma(z) = c * z**2`.
+        """
         self.lattice = block_lattice(box_min_m, box_max_m, block_size_m)
         self._intrinsics = intrinsics
+        self._share_min = share_min
         self._noise_per_m = SIGMAS * noise_per_m
         self._blocks = np.empty(self.lattice.cell_count, np.int32)
         self._views = np.empty((self.lattice.cell_count, 5), np.int32)
@@ -112,7 +117,6 @@ class Visibility:
         depth_raw: NDArray[np.uint16],
         static_limit_raw: NDArray[np.uint16],
         robot_near_raw: NDArray[np.uint16],
-        share_min: float,
     ) -> SeenBlocks:
         """The blocks that a frame looks through; images (H, W)."""
         kernels.seen_blocks(
@@ -122,7 +126,7 @@ class Visibility:
             self._blocks,
             self._views,
             self._number,
-            share_min,
+            self._share_min,
             self._rows_apart,
             self._reach_raw,
             self._seen,

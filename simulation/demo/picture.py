@@ -112,7 +112,7 @@ def merged_map(world: World, t_s: float) -> tuple[Lattice, NDArray[np.uint32], N
     reports = []
     for index, pose in enumerate(rig(world.cell)):
         frame = SimulatedCamera(world, pose, intrinsics, seed=index).capture(t_s)
-        voxels = DepthPipeline(intrinsics, pose, world.cell).process(frame.depth, frame.joints)
+        voxels = DepthPipeline(intrinsics, pose, world.cell).process(frame.depth, frame.joints).voxels
         reports.append(voxels.keys)
     keys, witnesses = np.unique(np.concatenate(reports), return_counts=True)
     return voxels.lattice, keys, witnesses

@@ -72,7 +72,7 @@ class RobotLayer:
         padding_m: (L,) float32, what the links are usually drawn with.
         near_raw, span_raw: (H, W) uint16, the band's lower end and its length.
         columns: (H, 2) int32, of each row the first column and the one after the last that may have a band.
-        band: all three, for kernels.
+        bundle: all three, for kernels.
     """
 
     def __init__(self, intrinsics: Intrinsics, robot: Robot | None, padding_m: float) -> None:
@@ -87,11 +87,11 @@ class RobotLayer:
         self.near_raw = np.full(intrinsics.shape, limits.RAW_MAX, np.uint16)
         self.span_raw = np.zeros(intrinsics.shape, np.uint16)
         self.columns = np.zeros((intrinsics.height, 2), np.int32)
-        self.band = plain(limits.Band(self.near_raw, self.span_raw, self.columns))
+        self.bundle = plain(limits.Band(self.near_raw, self.span_raw, self.columns))
 
     def forget(self) -> None:
         """Take the robot out: without joints nobody knows where it stands, and it is reported, not filtered."""
-        limits.clear_band(self.band)
+        limits.clear_band(self.bundle)
         self._is_shown = False
 
     def draw(
@@ -123,7 +123,7 @@ class RobotLayer:
             noise_per_m,
             depth_m,
             self._intrinsics.depth_scale_m,
-            self.band,
+            self.bundle,
         )
         self._is_shown = True
         return True

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from edge_unit.pipeline.edge_halo import EdgeHalo
 from edge_unit.pipeline.expected_depth import RobotLayer
+from edge_unit.pipeline.stage_times import StageRunner
 from geometry.kernels import density, points, voxelize
 from geometry.kernels.bundles import plain
 from shared.camera import Intrinsics
@@ -114,7 +115,23 @@ class Voxelizer:
             )
         )
 
-    def count(
+    def voxels(
+        self,
+        depth_raw: NDArray[np.uint16],
+        room_raw: NDArray[np.uint16],
+        minimum_raw: int,
+        robot: RobotLayer,
+        halo: EdgeHalo,
+        stages: StageRunner,
+    ) -> Voxels:
+        """Return the voxels that hold enough of the foreground of `depth_raw` (H, W).
+
+        `room_raw` (H, W) and `minimum_raw` as in `foreground.foreground_mask`.
+        """
+        found = stages.run("foreground", self._count, depth_raw, room_raw, minimum_raw, robot, halo)
+        return stages.run("density", self._keep_dense, found)
+
+    def _count(
         self,
         depth_raw: NDArray[np.uint16],
         room_raw: NDArray[np.uint16],
@@ -122,23 +139,20 @@ class Voxelizer:
         robot: RobotLayer,
         halo: EdgeHalo,
     ) -> int:
-        """Count the foreground of `depth_raw` (H, W); returns how many voxels hold any. `keep_dense` must follow.
-
-        `room_raw` (H, W) and `minimum_raw` as in `foreground.foreground_mask`.
-        """
+        """Count the foreground on the lattice; returns how many voxels hold any."""
         return points.count_foreground(
             depth_raw,
             room_raw,
             minimum_raw,
-            robot.band,
+            robot.bundle,
             halo.bundle,
             self._grid,
             self._mask,
             self._counter,
         )
 
-    def keep_dense(self, found: int) -> Voxels:
-        """The voxels that hold enough points, and forget all `found` of them."""
+    def _keep_dense(self, found: int) -> Voxels:
+        """Return the voxels that hold enough points, and forget all `found` of them."""
         # In the order of memory: judging them is then several times as fast, and the kept ones come sorted.
         self._touched[:found].sort()
         kept = density.keep_dense(self._counts, self._touched, found, self._view, self._rule, self._judged)

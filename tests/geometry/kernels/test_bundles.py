@@ -49,6 +49,8 @@ def a_frame_and_all_that_is_asked_of_it() -> None:
     pipeline.learn([(depth, HOME_RAD)])
 
 
+# Where no kernel is kept yet, one test compiles them all.
+@pytest.mark.timeout(300)
 @pytest.mark.usefixtures("a_frame_and_all_that_is_asked_of_it")
 @pytest.mark.parametrize("name", sorted(FROM_PYTHON_ONLY))
 def test_nobody_hands_a_kernel_a_named_tuple(name: str) -> None:

@@ -7,14 +7,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shared.errors import InputError
 
-Transform = NDArray[np.float64]
+Transform: TypeAlias = NDArray[np.float64]
 
 ROTATION_TOLERANCE = 1e-4
 """How far `R @ R.T` may be from the identity: poses are read from text files with few digits."""

@@ -88,12 +88,12 @@ class Metrics(Collector):
             info.add_metric((*unit, slot.serial, slot.record.model, slot.record.software), 1.0)
             for one in get_args(State):
                 states.add_metric((*unit, one), float(one == state))
-            for family, value in ((age, slot.age_s(now_ns)), (arrival_age, slot.arrival_age_s(now_ns))):
+            for family, value in ((age, slot.session.age_s(now_ns)), (arrival_age, slot.session.arrival_age_s(now_ns))):
                 if value is not None:
                     family.add_metric(unit, value)
-            fps.add_metric(unit, slot.fps)
-            voxels.add_metric(unit, len(slot.keys))
-            process.add_metric(unit, slot.health.process_ms / 1000.0)
+            fps.add_metric(unit, slot.session.fps)
+            voxels.add_metric(unit, len(self._master.map.keys_of(slot.id)))
+            process.add_metric(unit, slot.session.health.process_ms / 1000.0)
             updates.add_metric(unit, slot.updates)
             received.add_metric(unit, slot.received_bytes)
         yield from (info, states, age, arrival_age, fps, voxels, process, updates, received)

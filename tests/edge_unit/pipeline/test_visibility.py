@@ -6,8 +6,8 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_unit.pipeline import SeenBlocks, Voxels
-from edge_unit.pipeline.visibility import MAX_BLOCKS, Visibility
-from shared.lattice import Lattice
+from edge_unit.pipeline.visibility import Visibility
+from shared.lattice import MAX_BLOCKS, Lattice
 from shared.transforms import apply, inverse, look_at
 from tests.edge_unit.scenes import camera
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -476,7 +477,7 @@ def test_settings_that_are_refused_change_nothing(monkeypatch: pytest.MonkeyPatc
     def refuse(*_: Any) -> Lattice:
         raise InputError("no such blocks")
 
-    monkeypatch.setattr("master_server.core.master.blocks_of", refuse)
+    monkeypatch.setattr(Cell, "blocks", refuse)
     with pytest.raises(InputError):
         one.change_settings({"voxel_size_m": 0.04, "seen_block_size_m": 0.05})
     assert (one.settings, one.versions, one.lattice, one.coverage.blocks) == before
@@ -531,6 +532,40 @@ def test_commands_are_repeated_until_they_are_done() -> None:
     assert unit.update(NOW_NS, done=(Outcome(command.id, "too late"),)).commands == ()
     (row,) = one.units(NOW_NS)
     assert row.last_command == CommandRow(id=command.id, verb="learn_background", outcome=DONE)
+
+
+def test_who_asks_changes_and_logs_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    one = master()
+    unit = live(one, 1, 5)
+    command = one.ask(unit.initialized.id, "calibrate", NOW_NS)
+    slot = one.registry.get(unit.initialized.id)
+    one.tick(NOW_NS)
+    before = (one.map.revision, slot.told_state, slot.commands, slot.last_command, one.coverage.has(slot.id))
+    caplog.clear()
+    for now_ns, expected in ((NOW_NS, {5: 1}), (NOW_NS + 3600 * S, {}), (NOW_NS, {5: 1})):
+        view = one.view(now_ns)
+        assert dict(zip(view.keys.tolist(), view.witnesses.tolist(), strict=True)) == expected
+        assert (view.complete, view.units_live, sorted(view.reports)) == (
+            bool(expected),
+            len(expected),
+            [1][: len(expected)],
+        )
+        assert one.seen_by(now_ns).any() == bool(expected)
+        (row,), (told,) = one.units(now_ns), one.unit_states(now_ns)
+        assert row.state == told.state == ("live" if expected else "stale")
+        assert row.voxels == told.voxels == 1
+        assert row.last_command is not None
+        assert (row.last_command.outcome is None) == bool(expected)
+        one.next_change_ns(now_ns)
+        one.robot_answer(None, now_ns)
+    assert before == (one.map.revision, slot.told_state, (command,), slot.last_command, one.coverage.has(slot.id))
+    assert before[2] == (command,)
+    assert not caplog.records
+    one.tick(NOW_NS + 3600 * S)
+    assert slot.told_state == "stale"
+    assert slot.commands == ()
+    assert {record.levelname for record in caplog.records} == {"WARNING", "INFO"}
 
 
 def test_commands_are_bounded() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import viser
@@ -78,7 +78,7 @@ VIEW_FROM = np.array([0.98, 0.6, 0.66])
 VIEW_FOV_RAD = 0.8
 """Of who looks, vertically."""
 
-Points = NDArray[np.float32]
+Points: TypeAlias = NDArray[np.float32]
 
 
 PYRAMID = np.array([(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)])

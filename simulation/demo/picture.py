@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -68,7 +69,7 @@ CUBE_FACES = np.array(
 )  # fmt: skip
 """Of the corners above, anticlockwise from outside."""
 
-Colours = NDArray[np.float64]
+Colours: TypeAlias = NDArray[np.float64]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

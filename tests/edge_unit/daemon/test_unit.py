@@ -24,6 +24,7 @@ from edge_unit.config import PoseConfig, UnitConfig
 from edge_unit.daemon import report as reporting_module
 from edge_unit.daemon import unit as unit_module
 from edge_unit.daemon.frame_processor import FrameWork
+from edge_unit.daemon.joint_lookup import FrameJoints
 from edge_unit.daemon.refinement_task import REFINE_FRAMES
 from edge_unit.daemon.unit import Unit
 from edge_unit.daemon.warm_up import rehearse
@@ -422,6 +423,40 @@ async def test_joints_whose_times_are_late_are_looked_up_later(tmp_path: Path, m
             "the new settings",
         )
         assert await ahead() == pytest.approx(0.05, abs=0.02)
+
+
+async def test_no_frame_waits_for_the_look_at_the_joints_delay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path, with_robot=True)
+    looking, release, done = threading.Event(), threading.Event(), threading.Event()
+
+    def look() -> None:
+        looking.set()
+        assert release.wait(30.0)
+        done.set()
+
+    looks = iter([look])
+    monkeypatch.setattr(FrameJoints, "watch_delay", lambda *_: next(looks, None))
+
+    async def report(number: int) -> None:
+        """Show a frame and wait for its report."""
+        at_ns = monotonic_ns()
+        bench.master.put_joints(JointsRequest(positions=(0.0, 0.1), velocities=(0.0, 0.0), at_ns=at_ns), at_ns)
+        bench.show(patch(FAR_MM))
+        await bench.until(
+            lambda: (row := bench.row()) and row.arrival_age_s is not None and row.health.frame == number, "a report"
+        )
+
+    async with bench.running():
+        number = 0
+        while not looking.is_set():
+            # The first may come long after their joints, while kernels are compiled.
+            await report(number)
+            number += 1
+        for later in range(number, number + 3):
+            await report(later)
+        assert not done.is_set()
+        release.set()
+        await bench.until(done.is_set, "the look's end")
 
 
 async def test_joints_that_do_not_fit_are_a_trouble_and_no_end(tmp_path: Path) -> None:

@@ -39,9 +39,6 @@ MAX_SEEN_BYTES = 4096
 MAX_COMMANDS = 16
 """Pending for one unit; an operator who clicks on is told to wait."""
 
-DONE = "done"
-"""The outcome of a command that was carried out; any other is a sentence that says why it was not."""
-
 MAX_JOINT_SAMPLES = 32
 """In one answer: a slow unit at 5 fps gets all that it needs at one sample in 8 ms."""
 
@@ -80,6 +77,14 @@ Verb = Literal["learn_background", "drop_background", "calibrate", "refine", "im
 ImageKind = Literal["depth", "expected", "foreground"]
 PoseOrigin = Literal["configured", "board", "refined", "operator", "source"]
 ToldOrigin = Literal["configured", "source"]
+OutcomeCode = Literal["done", "refused", "failed", "superseded", "unanswered"]
+"""
+done        carried out
+refused     cannot be done as things are; nothing was tried
+failed      tried, and nothing is changed
+superseded  void, by what was asked or came about later
+unanswered  the unit did not answer in its time
+"""
 
 
 class Message(BaseModel):
@@ -162,10 +167,39 @@ class Command(Message):
 
 
 class Outcome(NamedTuple):
-    """What became of a command: `DONE`, perhaps with what it gained, or why it was not carried out."""
+    """What became of a command: a code for programs, and for people what it gained, or why it was not carried out."""
+
+    code: OutcomeCode
+    detail: Text = ""
+
+    @property
+    def sentence(self) -> str:
+        """`done`, whatever it gained, or why not."""
+        return self.code if self.code == "done" else self.detail
+
+
+DONE = Outcome("done")
+
+
+class Ended(NamedTuple):
+    """A command that came to an end, as it travels: units of contract 5.0 have no code, and say `done` in the text."""
 
     id: Counter
     text: Text
+    code: OutcomeCode | None = None
+
+    @classmethod
+    def of(cls, command_id: int, outcome: Outcome) -> Ended:
+        """The command of this id with its outcome; a detail that is too long is cut."""
+        return cls(command_id, outcome.detail[:MAX_TEXT], outcome.code)
+
+    @property
+    def outcome(self) -> Outcome:
+        """What became of it, whichever contract the unit speaks."""
+        if self.code is not None:
+            return Outcome(self.code, self.text)
+        head, _, gained = self.text.partition(": ")
+        return Outcome("done", gained) if head == "done" else Outcome("failed", self.text)
 
 
 class InitializeRequest(Message):
@@ -255,7 +289,7 @@ class UpdateRequest(Message):
     seen: SeenReport | None = Field(default=None, description="Absent: as it was in the update before.")
     health: Health = Health()
     joints_until_ns: Nanoseconds = Field(default=0, description="The newest joints that the unit has.")
-    done: tuple[Outcome, ...] = Field(default=(), max_length=MAX_COMMANDS, description="Commands that came to an end.")
+    done: tuple[Ended, ...] = Field(default=(), max_length=MAX_COMMANDS, description="Commands that came to an end.")
     phase: Phase = Field(default="live", description="How far the unit has come since it started.")
 
 
@@ -326,6 +360,13 @@ class CommandRow(Message):
     id: Counter
     verb: Verb
     outcome: Text | None = Field(description="`done`, or why not; absent while the unit is at it.")
+    code: OutcomeCode | None = Field(default=None, description="The same for programs.")
+    detail: Text = Field(default="", description="What it gained, or why it was not carried out.")
+
+    def ended(self, outcome: Outcome) -> CommandRow:
+        """The same, come to its end."""
+        told = {"outcome": outcome.sentence, "code": outcome.code, "detail": outcome.detail}
+        return self.model_copy(update=told)
 
 
 class UnitRow(Message):

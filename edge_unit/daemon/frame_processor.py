@@ -17,7 +17,7 @@ from edge_unit.pipeline import DepthPipeline
 from edge_unit.sources.frame import DepthFrame
 from edge_unit.uplink.uplink import Assignment, Report
 from shared.errors import InputError
-from shared.messages import Command
+from shared.messages import Command, Outcome
 from shared.transforms import Transform
 from shared.wire import keys_to_bytes
 
@@ -29,7 +29,7 @@ class FrameWork:
 
     def __init__(
         self,
-        finish: Callable[[Command, str], None],
+        finish: Callable[[Command, Outcome], None],
         assigned: AssignedPipeline,
         learning: Learning,
         refining: Refining,
@@ -70,7 +70,7 @@ class FrameWork:
             pipeline = self._assigned.prepare(assignment, T_world_camera)
         except InputError as error:
             for command in changes:
-                self._finish(command, str(error))
+                self._finish(command, Outcome("refused", str(error)))
             raise
         for command in changes:
             self._obey(command, pipeline)
@@ -85,7 +85,7 @@ class FrameWork:
         elif command.verb == "refine":
             self._refining.begin(pipeline, command)
         else:
-            self._finish(command, f"this unit does not know how to {command.verb}")
+            self._finish(command, Outcome("refused", f"this unit does not know how to {command.verb}"))
 
     def _report(
         self,

@@ -37,7 +37,7 @@ from edge_unit.uplink.master_discovery import MasterSearch
 from edge_unit.uplink.uplink import Assignment, Delivery, Report, Uplink
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import InputError, SourceError
-from shared.messages import Command
+from shared.messages import Command, Outcome
 from shared.transforms import Transform
 
 logger = logging.getLogger(__name__)
@@ -231,7 +231,7 @@ class Unit:
     async def _look_for_pose(self, assignment: Assignment, frame: DepthFrame, orders: Orders) -> None:
         """Say that nobody knows where the camera stands, and look for the board now and then."""
         self._assigned.pipeline = None
-        self._finish(orders.changes, NO_POSE)
+        self._finish(orders.changes, Outcome("refused", NO_POSE))
         searching = f"looking for the board: {self._search.outcome}" if self._search.outcome else None
         report = troubled(assignment, frame, searching)
         self._trouble = report.health.trouble or NO_POSE
@@ -275,6 +275,6 @@ class Unit:
             logger.info("%s", trouble or "frames are filtered and reported")
         self._trouble = trouble
 
-    def _finish(self, commands: list[Command], outcome: str) -> None:
+    def _finish(self, commands: list[Command], outcome: Outcome) -> None:
         for command in commands:
             self.uplink.finish(command, outcome)

@@ -39,9 +39,9 @@ from shared.messages import (
     CONTRACT_VERSION,
     DONE,
     MAX_COMMANDS,
-    MAX_TEXT,
     CellReference,
     Command,
+    Ended,
     Health,
     InitializeRequest,
     Outcome,
@@ -149,7 +149,7 @@ class Uplink:
         self._found_by = ""
         self._id = 0
         self._sequence = 0
-        self._done: list[Outcome] = []
+        self._done: list[Ended] = []
         self._open_commands: dict[int, Command] = {}
         self.assignment: Assignment | None = None
         self.assigned = asyncio.Event()
@@ -184,10 +184,10 @@ class Uplink:
         self._idle.clear()
         self._wake.set()
 
-    def finish(self, command: Command, outcome: str = DONE) -> None:
+    def finish(self, command: Command, outcome: Outcome = DONE) -> None:
         """A command came to an end: carried out, or why not; the master is told with the next update."""
         if command.id in self._open_commands:
-            self._done.append(Outcome(command.id, outcome[:MAX_TEXT]))
+            self._done.append(Ended.of(command.id, outcome))
 
     async def send_picture(self, command: Command, png: bytes) -> None:
         """Send the picture that a command asks for. Raises as `MasterClient.update`."""
@@ -440,10 +440,10 @@ class Uplink:
                 self._open_commands[command.id] = command
                 self.commands.put_nowait(command)
 
-    def _forget_commands(self, done: Iterable[Outcome]) -> None:
-        for outcome in done:
-            self._done.remove(outcome)
-            self._open_commands.pop(outcome.id, None)
+    def _forget_commands(self, done: Iterable[Ended]) -> None:
+        for ended in done:
+            self._done.remove(ended)
+            self._open_commands.pop(ended.id, None)
 
     def _assign(self, assignment: Assignment, how: str = "") -> None:
         self.assignment = assignment

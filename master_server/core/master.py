@@ -418,8 +418,8 @@ class Master:
         if update.captured_at_ns != slot.captured_at_ns and update.captured_at_ns is not None:
             slot.captures_ns.append(update.captured_at_ns)
         slot.captured_at_ns = update.captured_at_ns
-        for outcome in update.done:
-            slot.end(outcome)
+        for ended in update.done:
+            slot.end(ended.id, ended.outcome)
         if slot.asked:
             slot.expire(now_ns)
 

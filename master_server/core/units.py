@@ -158,29 +158,31 @@ class Slot:
         """Give up what the unit did not answer in its time."""
         for asked in [asked for asked in self.asked if asked.expires_at_ns <= now_ns]:
             limit_s = IMAGE_EXPIRES_S if asked.command.verb == "image" else COMMAND_EXPIRES_S
-            self.end(Outcome(asked.command.id, f"the unit did not answer within {limit_s:g} s"))
+            self.end(asked.command.id, Outcome("unanswered", f"the unit did not answer within {limit_s:g} s"))
 
-    def end(self, outcome: Outcome) -> None:
+    def end(self, command_id: int, outcome: Outcome) -> None:
         """A command came to an end; harmless when it had before."""
-        for asked in [asked for asked in self.asked if asked.command.id == outcome.id]:
+        for asked in [asked for asked in self.asked if asked.command.id == command_id]:
             self.asked.remove(asked)
             if asked.on_end is not None:
                 asked.on_end(outcome)
             verb = asked.command.verb
             level = logging.DEBUG if verb == "image" else logging.INFO
-            fields = {**self.log_fields("command"), "verb": verb}
+            fields = {**self.log_fields("command"), "verb": verb, "code": outcome.code}
+            gained = f": {outcome.detail}" if outcome.code == "done" and outcome.detail else ""
             logger.log(
                 level,
-                "unit %d (%s): command %d, %s: %s",
+                "unit %d (%s): command %d, %s: %s%s",
                 self.id,
                 self.ip,
-                outcome.id,
+                command_id,
                 verb,
-                outcome.text,
+                outcome.sentence,
+                gained,
                 extra=fields,
             )
-            if self.last_command is not None and self.last_command.id == outcome.id:
-                self.last_command = self.last_command.model_copy(update={"outcome": outcome.text})
+            if self.last_command is not None and self.last_command.id == command_id:
+                self.last_command = self.last_command.ended(outcome)
 
     def age_s(self, now_ns: int) -> float | None:
         """Seconds from the last frame's capture to the master's `now_ns`; None while it cannot be told."""

@@ -142,7 +142,8 @@ def table_html(rows: list[dict[str, Any]]) -> str:
         parts.append(f"<tr {data}>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
         notes = [row["reason"]] if row["reason"] else []
         if command := row["last_command"]:
-            notes.append(f"{command['verb']}: {command['outcome'] or 'under way'}")
+            detail = f": {command['detail']}" if command["code"] == "done" and command["detail"] else ""
+            notes.append(f"{command['verb']}: {command['outcome'] or 'under way'}{detail}")
         if notes:
             bar = _progress_html(row["reason"])
             parts.append(f'<tr><td class="why" colspan="8">{html.escape("; ".join(notes))}{bar}</td></tr>')

@@ -6,7 +6,7 @@ import sys
 import zlib
 from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import msgpack
 import numpy as np
@@ -20,11 +20,13 @@ from shared.messages import (
     MAX_SEEN_BYTES,
     MAX_VOXELS,
     Command,
+    Ended,
     Health,
     InitializeRequest,
     JointSample,
     LatticeDescription,
     Outcome,
+    OutcomeCode,
     RobotAnswer,
     SeenReport,
     UpdateAnswer,
@@ -66,7 +68,7 @@ def update(**changes: Any) -> UpdateRequest:
             valid_share=0.87, agreeing_share=0.95, residual_share=-0.01, static_share=0.5, process_ms=8.1, frame=10**7
         ),
         "joints_until_ns": LATE_NS,
-        "done": (Outcome(3, DONE), Outcome(4, "the board is not in view")),
+        "done": (Ended.of(3, DONE), Ended.of(4, Outcome("failed", "the board is not in view"))),
     }
     return UpdateRequest(**{**fields, **changes})
 
@@ -307,6 +309,7 @@ COUNTS = st.integers(0, 2**63 - 1)
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False, width=32)
 VERSIONS = st.builds(Versions, settings=COUNTS, lattice=COUNTS, cell=COUNTS, pose=COUNTS)
 TEXTS = st.text(st.characters(exclude_categories=("Cs",)), max_size=200)
+OUTCOMES = (None, *get_args(OutcomeCode))
 UPDATES = st.builds(
     UpdateRequest,
     id=COUNTS,
@@ -319,7 +322,7 @@ UPDATES = st.builds(
     keys=st.binary(max_size=80),
     health=st.builds(Health, valid_share=st.floats(0.0, 1.0), frame=COUNTS, trouble=st.none() | TEXTS),
     joints_until_ns=TIMES,
-    done=st.lists(st.builds(Outcome, COUNTS, TEXTS), max_size=3).map(tuple),
+    done=st.lists(st.builds(Ended, COUNTS, TEXTS, st.sampled_from(OUTCOMES)), max_size=3).map(tuple),
 )
 SAMPLES = st.builds(
     JointSample,

@@ -14,7 +14,7 @@ from master_server.core import Master
 from master_server.persistence import Store
 from master_server.recording.moment import StateRecord
 from shared.cell import Cell
-from shared.messages import InitializeAnswer, PoseAnswer, RobotAnswer
+from shared.messages import DONE, Ended, InitializeAnswer, Outcome, PoseAnswer, RobotAnswer
 from shared.settings import Settings
 from shared.wire import decode, decode_update, decode_update_answer
 from tests.system.conversation import GOLDEN, Step, Table, plain, recorded, recorded_cell
@@ -56,6 +56,30 @@ async def test_readers_of_5_0_find_what_they_found(table: Table) -> None:
     for now, before in zip(await table.replay(steps), steps, strict=True):
         if not before.is_units:
             assert keeps(plain(now), plain(before)), before.name
+
+
+async def test_what_a_unit_of_5_0_says_of_its_commands_has_a_code(table: Table) -> None:
+    told = {}
+    for step in await table.replay(recorded("5.0")):
+        if step.path == "/units" and (command := plain(step)[0]["last_command"]):
+            told[command["verb"]] = command["outcome"], command["code"], command["detail"]
+    why = "the pose of its camera is not known yet"
+    assert told == {"calibrate": ("done", "done", ""), "drop_background": (why, "failed", why)}
+
+
+@pytest.mark.parametrize(
+    ("text", "outcome"),
+    [
+        ("done", DONE),
+        ("done: moved by 3 mm: much", Outcome("done", "moved by 3 mm: much")),
+        ("donee: no", Outcome("failed", "donee: no")),
+        ("the board is not in view", Outcome("failed", "the board is not in view")),
+        ("", Outcome("failed", "")),
+    ],
+)
+def test_an_outcome_of_a_unit_of_5_0(text: str, outcome: Outcome) -> None:
+    assert Ended(1, text).outcome == outcome
+    assert Ended.of(1, outcome).outcome == outcome
 
 
 def answers() -> list[Step]:

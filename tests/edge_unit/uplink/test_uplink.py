@@ -31,6 +31,7 @@ from shared.messages import (
     InitializeRequest,
     JointSample,
     LatticeDescription,
+    Outcome,
     RobotAnswer,
     UpdateAnswer,
     UpdateRequest,
@@ -295,11 +296,17 @@ async def test_commands_are_carried_out_once_and_told_until_the_master_knows() -
         assert bench.uplink.commands.get_nowait() == command
         assert bench.uplink.commands.empty()
         bench.master.answers = [MasterUnreachable("nobody")]
-        bench.uplink.finish(command, "no board in view")
+        bench.uplink.finish(command, Outcome("failed", "no board in view"))
         before = len(bench.master.updates)
         await until(
             lambda: (
-                len([update for update in bench.master.updates[before:] if update.done == ((5, "no board in view"),)])
+                len(
+                    [
+                        update
+                        for update in bench.master.updates[before:]
+                        if update.done == ((5, "no board in view", "failed"),)
+                    ]
+                )
                 >= 2
             )
         )

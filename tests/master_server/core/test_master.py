@@ -19,6 +19,7 @@ from shared.messages import (
     DONE,
     MAX_COMMANDS,
     CommandRow,
+    Ended,
     Health,
     JointsRequest,
     Matrix,
@@ -527,10 +528,10 @@ def test_commands_are_repeated_until_they_are_done() -> None:
     assert unit.update(NOW_NS).commands == (command,)
     (row,) = one.units(NOW_NS)
     assert row.last_command == CommandRow(id=command.id, verb="learn_background", outcome=None)
-    assert unit.update(NOW_NS, done=(Outcome(command.id, DONE),)).commands == ()
-    assert unit.update(NOW_NS, done=(Outcome(command.id, "too late"),)).commands == ()
+    assert unit.update(NOW_NS, done=(Ended.of(command.id, DONE),)).commands == ()
+    assert unit.update(NOW_NS, done=(Ended.of(command.id, Outcome("failed", "too late")),)).commands == ()
     (row,) = one.units(NOW_NS)
-    assert row.last_command == CommandRow(id=command.id, verb="learn_background", outcome=DONE)
+    assert row.last_command == CommandRow(id=command.id, verb="learn_background", outcome="done", code="done")
 
 
 def test_commands_are_bounded() -> None:

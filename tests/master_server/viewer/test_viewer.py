@@ -288,7 +288,7 @@ def test_what_a_unit_says_of_itself_is_no_markup() -> None:
         "process_ms": 0.0,
         "voxels": 0,
         "health": {"valid_share": 0.0, "agreeing_share": 0.0, "static_share": 0.0},
-        "last_command": {"verb": "refine", "outcome": "<i>"},
+        "last_command": {"verb": "refine", "outcome": "<i>", "code": "failed", "detail": "<i>"},
     }
     shown = table_html([row])
     assert 'data-unit="1" data-state="stale"' in shown

@@ -75,9 +75,11 @@ class MasterUnreachable(UplinkError):
 class MasterRefused(UplinkError):
     """The master answered with a refusal."""
 
-    def __init__(self, message: str, status: int) -> None:
+    def __init__(self, message: str, status: int, detail: str = "") -> None:
+        """`detail` is the sentence of the master alone."""
         super().__init__(message)
         self.status = status
+        self.detail = detail
 
 
 class Refusal(CellwatchError):

@@ -3,13 +3,28 @@
 
 Times are integers of nanoseconds: `_at_ns` of a unit by its CLOCK_MONOTONIC, of the master and of
 joints by the master's. Every text, list and array is bounded, since anyone on the network may send one.
+
+The contract has a major and a minor number. Within a major, a unit works with any master whose minor is at least its
+own, so a master is updated before its units. What that asks of whoever changes this file:
+
+    requests        get new names with defaults; a unit sends them to no master that is older, for none takes it in
+    answers         `Answer`: the names beside settings, lattice, cell, pose, joints and commands are status, and a
+                    unit ignores those that it does not know; nothing that a unit must obey is put there
+    what is obeyed  settings, lattice, cell, pose, joints, commands: a unit refuses names that it does not know, since
+                    it would filter where it must not, and tells so as its trouble `contract`. So a master leaves new
+                    names out where nothing uses them, and asks a unit for no verb that its minor does not have
+    rows            of values without names are longer at their end: a unit ignores what is beyond those it knows, a
+                    master takes a shorter row as one whose last values are at their defaults
+    defaults        never change, since what is at its default may not travel
+
+What each minor said is recorded in `tests/shared/golden`, and stays as it is.
 """
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from shared.camera import Intrinsics
 from shared.errors import InputError
@@ -19,7 +34,10 @@ from shared.timebase import Exchange
 from shared.transforms import Transform, validated
 
 CONTRACT_VERSION = 5
-"""Rises when a unit of the old contract and a master of the new one can no longer work together."""
+"""The major number: rises when a unit of the old contract and a master of the new one can no longer work together."""
+
+CONTRACT_MINOR = 1
+"""Rises with each addition, at most once a release. 5.0 had no outcome codes, no trouble codes and no progress."""
 
 MAX_TEXT = 200
 """Enough for a serial, a version or one sentence; keeps tables and logs readable."""
@@ -50,6 +68,13 @@ MAX_IMAGE_BYTES = 2**22
 """Of one picture: 1280 x 720 in three colours has 2.8 MB even when nothing of it can be compressed."""
 
 
+def is_newer(contract: object, minor: object) -> bool:
+    """Return True if this is the contract, by its two numbers, of a program that is newer than this one."""
+    if not isinstance(contract, int) or not isinstance(minor, int):
+        return False
+    return (contract, minor) > (CONTRACT_VERSION, CONTRACT_MINOR)
+
+
 def _printable(text: str) -> str:
     if not text.isprintable():
         raise ValueError("expected printable characters only, since it is written into logs")
@@ -60,6 +85,7 @@ Text = Annotated[str, Field(max_length=MAX_TEXT)]
 Label = Annotated[Text, AfterValidator(_printable)]
 Nanoseconds = Annotated[int, Field(ge=0, lt=2**63)]
 Counter = Annotated[int, Field(ge=0, lt=2**63)]
+Minor = Annotated[int, Field(ge=0, lt=2**31)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 JointValues = Annotated[tuple[float, ...], Field(max_length=MAX_JOINTS)]
 # Strict, for true is no angle.
@@ -93,7 +119,13 @@ class Message(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class Versions(Message):
+class Answer(Message):
+    """A message that one who is older may read: unknown names are ignored, those of what it holds are not."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+class Versions(Answer):
     """Counters of the master that rise with each change; a unit tells which ones it works with."""
 
     settings: Counter = 0
@@ -206,6 +238,7 @@ class InitializeRequest(Message):
     """A unit with its camera asks for its slot (Algorithm 8)."""
 
     contract: int = Field(ge=0, lt=2**31)
+    contract_minor: Minor = Field(default=0, description="Units of 5.0 have none.")
     serial: Label = Field(min_length=1, description="Serial number of the camera.")
     model: Label = ""
     intrinsics: Intrinsics
@@ -217,6 +250,14 @@ class InitializeRequest(Message):
     pose_origin: ToldOrigin = "configured"
     sent_at_ns: Nanoseconds
 
+    @model_validator(mode="before")
+    @classmethod
+    def _known_part(cls, fields: Any) -> Any:
+        """Of a newer unit only the names known here, so that it is refused for its contract and not for a name."""
+        if isinstance(fields, dict) and is_newer(fields.get("contract"), fields.get("contract_minor", 0)):
+            return {name: value for name, value in fields.items() if name in cls.model_fields}
+        return fields
+
     @field_validator("T_world_camera")
     @classmethod
     def _rigid(cls, value: Matrix | None) -> Matrix | None:
@@ -225,7 +266,7 @@ class InitializeRequest(Message):
         return value
 
 
-class InitializeAnswer(Message):
+class InitializeAnswer(Answer):
     """The slot, and all that a unit needs to begin."""
 
     id: Counter
@@ -239,6 +280,18 @@ class InitializeAnswer(Message):
     joints: tuple[JointSample, ...] = Field(default=(), max_length=MAX_JOINT_SAMPLES)
     received_at_ns: Nanoseconds
     answered_at_ns: Nanoseconds
+    contract_minor: Minor = Field(default=0, description="The master's; a unit of 5.0 is not told.")
+
+
+class SlotAnswer(Answer):
+    """The part of `InitializeAnswer` that a unit of any minor can read."""
+
+    id: Counter
+    session: Counter
+    versions: Versions
+    received_at_ns: Nanoseconds
+    answered_at_ns: Nanoseconds
+    contract_minor: Minor = 0
 
 
 class SeenReport(Message):
@@ -293,7 +346,7 @@ class UpdateRequest(Message):
     phase: Phase = Field(default="live", description="How far the unit has come since it started.")
 
 
-class UpdateAnswer(Message):
+class UpdateAnswer(Answer):
     """What a unit needs next. Settings, lattice, cell and pose only where the unit's version is another."""
 
     versions: Versions
@@ -354,7 +407,7 @@ class RobotAnswer(Message):
     joints: tuple[JointSample, ...]
 
 
-class CommandRow(Message):
+class CommandRow(Answer):
     """The last thing that an operator asked of a unit."""
 
     id: Counter
@@ -369,7 +422,7 @@ class CommandRow(Message):
         return self.model_copy(update=told)
 
 
-class UnitRow(Message):
+class UnitRow(Answer):
     """One unit in `GET /units`."""
 
     id: Counter
@@ -398,10 +451,13 @@ class UnitRow(Message):
         default=None, description="How far before its camera the farthest block of the cell lies that it looks through."
     )
     versions: Versions
+    contract_minor: int | None = Field(
+        default=None, description="Of the contract that the unit speaks; absent until it registered with this master."
+    )
     last_command: CommandRow | None = None
 
 
-class VoxelsAnswer(Message):
+class VoxelsAnswer(Answer):
     """`GET /voxels`: the merged map. `voxels` are indices (N, 3), centres (N, 3) in m or keys (N,), as asked for."""
 
     lattice: LatticeDescription

@@ -15,6 +15,8 @@ import httpx
 from edge_unit.tls import tls_context
 from shared.errors import ConfigError, MasterRefused, MasterUnreachable, WireError
 from shared.messages import (
+    CONTRACT_MINOR,
+    CONTRACT_VERSION,
     ImageKind,
     InitializeAnswer,
     InitializeRequest,
@@ -123,8 +125,23 @@ class MasterClient:
         self._http.headers["Authorization"] = f"Bearer {token}"
 
     async def initialize(self, request: InitializeRequest) -> InitializeAnswer:
-        """Ask for a slot. Raises as `update`."""
-        return decode(InitializeAnswer, await self._call("POST", "/initialize", encode(request)))
+        """Ask for a slot. Raises as `update`; a master of an older contract than the unit's has refused."""
+        try:
+            answer = decode(InitializeAnswer, await self._call("POST", "/initialize", encode(request)))
+        except MasterRefused as error:
+            # All that a master of contract 5.0 has to say of a minor number.
+            if error.status == 422 and error.detail.startswith("contract_minor:"):
+                raise self._older(0) from error
+            raise
+        if answer.contract_minor < request.contract_minor:
+            raise self._older(answer.contract_minor)
+        return answer
+
+    def _older(self, minor: int) -> MasterRefused:
+        """What a master of an older minor has refused, whether it knows or not."""
+        ours = f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
+        detail = f"contract: this master speaks version {CONTRACT_VERSION}.{minor}, this unit {ours}"
+        return MasterRefused(f"{self.url}/initialize: {detail}; update the master first", 400, detail)
 
     async def update(self, update: UpdateRequest) -> UpdateAnswer:
         """Report a frame.
@@ -188,7 +205,8 @@ class MasterClient:
         except httpx.HTTPError as error:
             raise MasterUnreachable(f"{self.url}{path}: {str(error) or type(error).__name__}") from error
         if response.is_error:
-            raise MasterRefused(f"{self.url}{path}: {response.status_code}: {_reason(received)}", response.status_code)
+            status, detail = response.status_code, _reason(received)
+            raise MasterRefused(f"{self.url}{path}: {status}: {detail}", status, detail)
         return bytes(received)
 
 

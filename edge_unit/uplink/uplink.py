@@ -36,6 +36,7 @@ from shared.clock import monotonic_ns
 from shared.errors import CellwatchError, ConfigError, MasterRefused, MasterUnreachable, WireError
 from shared.lattice import Lattice
 from shared.messages import (
+    CONTRACT_MINOR,
     CONTRACT_VERSION,
     DONE,
     MAX_COMMANDS,
@@ -301,6 +302,7 @@ class Uplink:
         answer = await self._client.initialize(
             InitializeRequest(
                 contract=CONTRACT_VERSION,
+                contract_minor=CONTRACT_MINOR,
                 serial=camera.serial,
                 model=camera.model,
                 intrinsics=camera.intrinsics,

@@ -26,6 +26,7 @@ from shared.configuration import sentence
 from shared.errors import Refusal
 from shared.lattice import Lattice
 from shared.messages import (
+    CONTRACT_MINOR,
     CONTRACT_VERSION,
     CellAnswer,
     Command,
@@ -43,6 +44,7 @@ from shared.messages import (
     UpdateRequest,
     Verb,
     Versions,
+    is_newer,
     matrix_of,
 )
 from shared.settings import Settings
@@ -118,8 +120,13 @@ class Master:
             Refusal: it speaks another contract, its camera reports from elsewhere, another camera reports from
                 its IP, there are too many units, or it cannot be stored.
         """
-        if request.contract != CONTRACT_VERSION:
-            raise Refusal(400, f"contract: this master speaks version {CONTRACT_VERSION}, the unit {request.contract}")
+        if request.contract != CONTRACT_VERSION or request.contract_minor > CONTRACT_MINOR:
+            first = "the master" if is_newer(request.contract, request.contract_minor) else "the unit"
+            raise Refusal(
+                400,
+                f"contract: this master speaks version {CONTRACT_VERSION}.{CONTRACT_MINOR}, the unit "
+                f"{request.contract}.{request.contract_minor}; update {first} first",
+            )
         slot, retired = self.registry.initialize(request, ip, now_ns, self.settings.stale_after_s)
         for gone in (slot, *retired):
             self._withdraw(gone.id)
@@ -136,6 +143,7 @@ class Master:
             joints=self.robot.since(0),
             received_at_ns=now_ns,
             answered_at_ns=now_ns,
+            contract_minor=CONTRACT_MINOR,
         )
 
     def update(self, update: UpdateRequest, ip: str, now_ns: int) -> UpdateAnswer:

@@ -98,6 +98,7 @@ class Slot:
     keys: NDArray[np.uint32] = field(default_factory=lambda: NO_KEYS)
     health: Health = field(default_factory=Health)
     phase: Phase = "registering"
+    contract_minor: int | None = None
     told_pose: Matrix | None = None
     warning: str = ""
     asked: deque[_Asked] = field(default_factory=deque)
@@ -124,7 +125,7 @@ class Slot:
         self.T_world_camera, self.pose_version = record.T_world_camera, record.pose_version
         self.warning = _pose_warning(record, self.told_pose)
 
-    def begin_session(self, told_pose: Matrix | None) -> None:
+    def begin_session(self, told_pose: Matrix | None, contract_minor: int | None = None) -> None:
         """The unit registered; whatever it said before is void."""
         # Random, so that a session of a master before this one is never mistaken for a current one.
         self.session = secrets.randbits(32)
@@ -137,6 +138,7 @@ class Slot:
         self.health = Health()
         self.phase = "fetching"
         self.told_pose = told_pose
+        self.contract_minor = contract_minor
         self.warning = _pose_warning(self.record, told_pose)
 
     @property
@@ -279,6 +281,7 @@ class Slot:
             intrinsics=self.record.intrinsics,
             range_m=range_m,
             versions=self.versions,
+            contract_minor=self.contract_minor,
             last_command=self.last_command,
         )
 
@@ -383,7 +386,7 @@ class Registry:
         elif slot.serial != record.serial:
             logger.warning("unit %d (%s): %s", slot.id, ip, record.note, extra=slot.log_fields("camera"))
         slot.become(record)
-        slot.begin_session(request.T_world_camera)
+        slot.begin_session(request.T_world_camera, request.contract_minor)
         if slot.warning:
             logger.warning("unit %d (%s): %s", slot.id, ip, slot.warning, extra=slot.log_fields("pose"))
         return slot, elsewhere

@@ -213,7 +213,7 @@ def test_bad_seen_reports_are_refused(shape: tuple[int, int, int], bits: bytes) 
         ({"health": [float("nan"), 0.5, 0.0, 0.5, 1.0, 1, None, None, None, None]}, "health.valid_share"),
         ({"health": [1.1, 0.5, 0.0, 0.5, 1.0, 1, None, None, None, None]}, "health.valid_share"),
         ({"health": [0.5, 0.5, 0.0, 0.5, 1.0, 1, "x" * 201, None, None, None]}, "health.trouble"),
-        ({"health": [0.5] * 9}, "health: expected an array of 10 values"),
+        ({"health": [0.5] * 9}, "health: expected an array of 10"),
         ({"seen": {"block_size_m": 0.1, "shape": [1, 1, 0], "bits": b""}}, "seen.shape"),
         ({"seen": {"block_size_m": 0.1, "shape": [1, 1, 1], "bits": b"x" * (MAX_SEEN_BYTES + 1)}}, "seen.bits"),
         ({"done": list(range(17))}, "done"),

@@ -5,19 +5,40 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import httpx
+import msgpack
 import pytest
 
+from edge_unit.uplink.client import MasterClient
+from edge_unit.uplink.master_selection import Wanted, objection
+from edge_unit.uplink.uplink import NOT_OURS
 from master_server.core import Master
 from master_server.persistence import Store
 from master_server.recording.moment import StateRecord
+from shared.camera import Intrinsics
 from shared.cell import Cell
-from shared.messages import DONE, Ended, InitializeAnswer, Outcome, PoseAnswer, RobotAnswer
+from shared.discovery import Announcement, offer_of
+from shared.errors import CellError, MasterRefused, WireError
+from shared.messages import (
+    CONTRACT_MINOR,
+    CONTRACT_VERSION,
+    DONE,
+    Ended,
+    InitializeAnswer,
+    InitializeRequest,
+    Outcome,
+    PoseAnswer,
+    RobotAnswer,
+    Versions,
+)
 from shared.settings import Settings
-from shared.wire import decode, decode_update, decode_update_answer
-from tests.system.conversation import GOLDEN, Step, Table, plain, recorded, recorded_cell
+from shared.wire import decode, decode_update, decode_update_answer, encode, unpack
+from tests.system.conversation import GOLDEN, UNIT, Step, Table, plain, recorded, recorded_cell
 
 ANSWERS = {"/initialize": InitializeAnswer, "/robot": RobotAnswer, "/units/1/pose": PoseAnswer}
 """What a unit reads, by path; beside the answers to updates, and the cell."""
@@ -96,6 +117,127 @@ def test_what_a_master_of_5_0_answered_is_read(step: Step) -> None:
         assert Cell.from_document(plain(step), recorded_cell("5.0")[1]).name == "golden"
     else:
         assert keeps(decode(ANSWERS[path], step.answer).model_dump(mode="json"), plain(step))
+
+
+@pytest.mark.parametrize("more", [{}, {"lidar": {"lines": 16}}])
+async def test_a_unit_of_a_newer_minor_is_told_to_wait_for_its_master(table: Table, more: dict[str, Any]) -> None:
+    asked = unpack(recorded("5.0")[0].body, 2**20) | {"contract_minor": CONTRACT_MINOR + 1} | more
+    told = await table.say("", "POST", "/initialize", UNIT, msgpack.packb(asked))
+    assert told.status == 400
+    for word in (f"5.{CONTRACT_MINOR}", f"5.{CONTRACT_MINOR + 1}", "update the master first"):
+        assert word in plain(told)["detail"]
+    assert len(table.master.registry) == 0
+    # Of our own minor, a name that nobody knows is one that was misspelt.
+    own = await table.say("", "POST", "/initialize", UNIT, msgpack.packb(asked | {"contract_minor": CONTRACT_MINOR}))
+    assert own.status == (422 if more else 200)
+
+
+async def test_a_unit_of_an_older_major_is_to_be_updated(table: Table) -> None:
+    asked = unpack(recorded("5.0")[0].body, 2**20) | {"contract": 4}
+    told = await table.say("", "POST", "/initialize", UNIT, msgpack.packb(asked))
+    assert told.status == 400
+    assert "update the unit first" in plain(told)["detail"]
+
+
+def client_of(*answers: Step) -> MasterClient:
+    """A client of a master that gives these answers, one after the other."""
+    pending = iter(answers)
+
+    def answer(_: httpx.Request) -> httpx.Response:
+        step = next(pending)
+        return httpx.Response(step.status, content=step.answer)
+
+    return MasterClient("http://master", lambda: UNIT, transport=httpx.MockTransport(answer))
+
+
+def request_of_now() -> InitializeRequest:
+    return InitializeRequest(
+        contract=CONTRACT_VERSION,
+        contract_minor=CONTRACT_MINOR,
+        serial="A",
+        intrinsics=Intrinsics(8, 6, 10.0, 10.0, 4.0, 3.0),
+        sent_at_ns=1,
+    )
+
+
+@pytest.mark.parametrize("name", ["a newer minor is refused", "registers without a pose"])
+async def test_a_unit_says_that_its_master_is_too_old(name: str) -> None:
+    step = next(step for step in recorded("5.0") if step.name == name)
+    async with client_of(step) as client:
+        with pytest.raises(MasterRefused, match=r"speaks version 5\.0.*update the master first") as refused:
+            await client.initialize(request_of_now())
+    assert refused.value.status in NOT_OURS
+
+
+async def test_what_else_a_master_refuses_is_told_as_it_says() -> None:
+    step = replace(recorded("5.0")[0], answer=b'{"detail":"serial: field required"}')
+    async with client_of(step) as client:
+        with pytest.raises(MasterRefused, match="422: serial: field required"):
+            await client.initialize(request_of_now())
+
+
+async def test_a_unit_ignores_what_it_need_not_know_of_a_newer_master(table: Table) -> None:
+    asked = encode(request_of_now())
+    told = plain(await table.say("", "POST", "/initialize", UNIT, asked))
+    assert told["contract_minor"] == CONTRACT_MINOR
+    newer = told | {"contract_minor": CONTRACT_MINOR + 1, "mood": "good"}
+    newer["versions"] = told["versions"] | {"attachments": 3}
+    async with client_of(Step("", "", "", UNIT, b"", 200, msgpack.packb(newer))) as client:
+        assert (await client.initialize(request_of_now())).session == told["session"]
+    update = {"versions": [1, 1, 1, 0, 3], "received_at_ns": 5, "answered_at_ns": 6, "mood": "good"}
+    assert decode_update_answer(msgpack.packb(update)).versions == Versions(settings=1, lattice=1, cell=1)
+
+
+def worse(step: Step, *path: str) -> bytes:
+    """An answer with a name more in one of its parts."""
+    fields = part = plain(step)
+    for name in path:
+        part = part[name]
+    part["newer"] = 1
+    return bytes(msgpack.packb(fields))
+
+
+@pytest.mark.parametrize(
+    ("name", "path"),
+    [
+        ("gets settings", ["settings"]),
+        ("gets settings", ["lattice"]),
+        ("learns of another cell", ["cell"]),
+        ("registers without a pose", ["settings"]),
+        ("registers without a pose", ["cell"]),
+        ("asks for joints", []),
+        ("tells its pose", []),
+    ],
+)
+def test_a_unit_refuses_what_it_would_have_to_obey(name: str, path: list[str]) -> None:
+    step = next(step for step in recorded("5.0") if step.name == name)
+    asked = step.path.split("?")[0]
+    read = decode_update_answer if asked == "/update" else partial(decode, ANSWERS[asked])
+    with pytest.raises(WireError, match="newer"):
+        read(worse(step, *path))
+
+
+def test_a_unit_refuses_a_cell_of_which_it_does_not_know_all() -> None:
+    document, meshes = recorded_cell("5.0")
+    for part in (document, document["objects"][0], document["robot"], document["board"]):
+        part["newer"] = 1
+        with pytest.raises(CellError, match="newer"):
+            Cell.from_document(document, meshes)
+        del part["newer"]
+    assert Cell.from_document(document, meshes).name == "golden"
+
+
+def test_a_master_of_5_0_announces_itself_without_a_minor() -> None:
+    heard = offer_of("a", 8420, ["10.0.0.2"], {b"cell": b"golden", b"contract": b"5"})
+    assert (heard.says.contract, heard.says.minor) == (5, 0)
+    why = objection(heard, Wanted(), None)
+    assert why is not None
+    assert "update the master first" in why
+    newer = Announcement("golden", "00", CONTRACT_VERSION, minor=CONTRACT_MINOR + 1)
+    told = {name.encode(): value.encode() for name, value in newer.properties().items()}
+    assert objection(offer_of("a", 8420, ["10.0.0.2"], told), Wanted(), None) is None
+    major = replace(newer, contract=CONTRACT_VERSION + 1)
+    assert "update this unit first" in (objection(replace(heard, says=major), Wanted(), None) or "")
 
 
 def test_no_setting_of_5_0_has_another_name_or_default() -> None:

@@ -298,18 +298,8 @@ async def test_commands_are_carried_out_once_and_told_until_the_master_knows() -
         bench.master.answers = [MasterUnreachable("nobody")]
         bench.uplink.finish(command, Outcome("failed", "no board in view"))
         before = len(bench.master.updates)
-        await until(
-            lambda: (
-                len(
-                    [
-                        update
-                        for update in bench.master.updates[before:]
-                        if update.done == ((5, "no board in view", "failed"),)
-                    ]
-                )
-                >= 2
-            )
-        )
+        ended = ((5, "no board in view", "failed"),)
+        await until(lambda: len([update for update in bench.master.updates[before:] if update.done == ended]) >= 2)
         await until(lambda: bench.master.updates[-1].done == ())
 
 

@@ -159,7 +159,7 @@ def test_there_is_an_end_to_slots() -> None:
 
 def test_another_contract_is_refused() -> None:
     one = master()
-    with pytest.raises(Refusal, match=f"version {CONTRACT_VERSION}, the unit {CONTRACT_VERSION + 1}"):
+    with pytest.raises(Refusal, match=f"the unit {CONTRACT_VERSION + 1}.*update the master first"):
         one.initialize(FakeUnit(one).introduction(NOW_NS, contract=CONTRACT_VERSION + 1), "10.0.0.1", NOW_NS)
     assert one.units(NOW_NS) == []
 

@@ -22,6 +22,7 @@ What each minor said is recorded in `tests/shared/golden`, and stays as it is.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -103,6 +104,26 @@ Verb = Literal["learn_background", "drop_background", "calibrate", "refine", "im
 ImageKind = Literal["depth", "expected", "foreground"]
 PoseOrigin = Literal["configured", "board", "refined", "operator", "source"]
 ToldOrigin = Literal["configured", "source"]
+TroubleCode = Literal["camera", "board", "background", "joints", "frame", "contract"]
+"""
+camera      it delivers no frames
+board       the camera's pose is not known, and the board is looked for
+background  it is being learned
+joints      where the robot is, is not known, and no frame can do without
+frame       cannot be processed with this cell, pose and settings
+contract    the master asks what this unit's minor does not know; update the unit
+"""
+ReasonCode = Literal[
+    TroubleCode,
+    "trouble", "no_pose", "pose_void",
+    "no_update", "late_update", "no_frame", "clock_unknown", "clock_uncertain", "late_frame", "clock_jumped",
+    "old_lattice", "old_cell", "old_pose",
+    "covered", "few_pixels", "moved", "few_surfaces",
+    "pose_differs", "warning",
+    "not_seen", "no_unit", "robot_silent", "robot_stale",
+]  # fmt: skip
+"""Why a unit is in its state, or the map not complete: what units tell as their trouble (`trouble`: one of contract
+5.0, which has no codes), then by the states uncalibrated, stale, blind and moved, live with a warning; then the map."""
 OutcomeCode = Literal["done", "refused", "failed", "superseded", "unanswered"]
 """
 done        carried out
@@ -309,6 +330,26 @@ class SeenReport(Message):
     bits: bytes = Field(max_length=MAX_SEEN_BYTES)
 
 
+@dataclass(frozen=True)
+class Reason:
+    """Why something is as it is: a code and named numbers for programs, a sentence for people.
+
+    Numbers are in the units that end their names; `unit` is the id of the unit that it is about.
+    """
+
+    code: ReasonCode
+    sentence: str
+    numbers: dict[str, float] = field(default_factory=dict)
+
+
+class Progress(Message):
+    """How far a task has come: `done` of `total` frames."""
+
+    task: Literal["background"]
+    done: Counter
+    total: Counter
+
+
 class Health(Message):
     """How far a unit's view can be trusted, with the frame that it tells of."""
 
@@ -326,6 +367,8 @@ class Health(Message):
     warning: Text | None = Field(default=None, description="What is worse than it need be, though it works.")
     moved: Text | None = Field(default=None, description="Why the camera seems to stand elsewhere than its pose says.")
     blind: Text | None = Field(default=None, description="Why the camera seems covered or dazzled.")
+    trouble_code: TroubleCode | None = Field(default=None, description="What is wrong, for programs; since 5.1.")
+    progress: Progress | None = Field(default=None, description="Of what is to be waited for; since 5.1.")
 
 
 class UpdateRequest(Message):
@@ -432,6 +475,7 @@ class UnitRow(Answer):
     software: str
     state: State
     reason: str
+    cause: Reason | None = Field(default=None, description="The reason for programs; absent where there is none.")
     phase: Phase = Field(default="live", description="How far it has come: registering, fetching, localising, live.")
     age_s: float | None = Field(description="Since the capture of its last frame.")
     arrival_age_s: float | None = Field(description="Since its last update arrived.")
@@ -466,6 +510,7 @@ class VoxelsAnswer(Answer):
     witnesses: list[int] = Field(description="How many live units report each voxel.")
     complete: bool = Field(description="False whenever a voxel's absence proves nothing.")
     reasons: list[str] = Field(description="Why it is not complete.")
+    causes: list[Reason] = Field(default=[], description="The same for programs, in the same order.")
     oldest_view_age_s: float | None
     units_live: int
     now_ns: Nanoseconds

@@ -39,6 +39,7 @@ from shared.messages import (
     MAX_VOXELS,
     Health,
     JointSample,
+    Progress,
     SeenReport,
     UpdateAnswer,
     UpdateRequest,
@@ -111,6 +112,10 @@ def encode_update(update: UpdateRequest) -> bytes:
     fields = update.model_dump(exclude_defaults=True)
     for name in fields.keys() & ROWS:
         fields[name] = _VALUES[name](getattr(update, name))
+    if update.health.progress is not None:
+        fields["health"] = tuple(
+            tuple(value.model_dump().values()) if isinstance(value, Progress) else value for value in fields["health"]
+        )
     packed: bytes = msgpack.packb(fields)
     return packed
 
@@ -247,7 +252,11 @@ def _named(fields: Any, of_newer: bool) -> Any:
                     count = f"{least}" if least == most else f"{least} to {most}"
                     raise WireError(f"{name}: expected an array of {count} values, got {repr(row)[:SHOWN_CHARS]}")
                 # Shorter is an older unit's, longer a newer master's.
-                fields[name] = dict(zip(names, row, strict=False))
+                fields[name] = named = dict(zip(names, row, strict=False))
+                if isinstance(progress := named.get("progress"), tuple):
+                    if len(progress) > len(Progress.model_fields):
+                        raise WireError(f"{name}: expected a progress of 3 values, got {repr(progress)[:SHOWN_CHARS]}")
+                    named["progress"] = dict(zip(Progress.model_fields, progress, strict=False))
     return fields
 
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from edge_unit.daemon.background_store import BackgroundStore, Place
 from edge_unit.joints import JointEstimate
 from edge_unit.pipeline import DepthPipeline, ReferenceLearner
-from shared.messages import DONE, Command, Outcome
+from edge_unit.uplink.uplink import Trouble
+from shared.messages import DONE, Command, Outcome, Progress
 
 logger = logging.getLogger(__name__)
 
@@ -92,7 +93,7 @@ class Learning:
 
     def add(
         self, pipeline: DepthPipeline, place: Place, depth: NDArray[np.uint16], joints: JointEstimate | None
-    ) -> str | None:
+    ) -> Trouble | None:
         """Learn from a frame (H, W); returns why nothing is to be reported yet, None when nothing is to be learned.
 
         Raises:
@@ -102,11 +103,12 @@ class Learning:
         if lesson is None:
             return None
         if pipeline.cell.robot is not None and joints is None:
-            return "learning the background: it waits for the robot's joints"
+            return Trouble("joints", "learning the background: it waits for the robot's joints")
         pipeline.learn_frame(lesson.learner, depth, None if joints is None else joints.positions)
         done = lesson.learner.frames
         if done < lesson.frames:
-            return f"learning the background: frame {done} of {lesson.frames}"
+            progress = Progress(task="background", done=done, total=lesson.frames)
+            return Trouble("background", f"learning the background: frame {done} of {lesson.frames}", progress)
         reference = lesson.learner.reference()
         pipeline.use(reference)
         self.keep(pipeline, place)

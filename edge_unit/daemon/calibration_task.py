@@ -9,7 +9,7 @@ from edge_unit.calibration.board_layout import require_board
 from edge_unit.calibration.board_scan import BoardSearch
 from edge_unit.daemon.report import troubled
 from edge_unit.sources.frame import DepthFrame
-from edge_unit.uplink.uplink import Assignment, Uplink
+from edge_unit.uplink.uplink import Assignment, Trouble, Uplink
 from shared.errors import CellwatchError
 from shared.messages import DONE, Outcome, PoseQuality
 
@@ -23,7 +23,7 @@ async def localise(search: BoardSearch, uplink: Uplink, assignment: Assignment, 
     """
 
     def tell(seen: str) -> None:
-        uplink.offer(troubled(assignment, frame, seen))
+        uplink.offer(troubled(assignment, frame, Trouble("board", seen)))
 
     first = not search.outcome
     try:

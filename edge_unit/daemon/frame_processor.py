@@ -15,7 +15,7 @@ from edge_unit.joints import JointEstimate
 from edge_unit.monitoring import Stages, Stance
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.sources.frame import DepthFrame
-from edge_unit.uplink.uplink import Assignment, Report
+from edge_unit.uplink.uplink import Assignment, Report, Trouble
 from shared.errors import InputError
 from shared.messages import Command, Outcome
 from shared.transforms import Transform
@@ -62,7 +62,7 @@ class FrameWork:
             return self._report(pipeline, assignment, frame, joints, stages)
         except InputError as error:
             logger.warning("frame %d: %s", frame.frame_number, error)
-            return troubled(assignment, frame, str(error))
+            return troubled(assignment, frame, Trouble("frame", str(error)))
 
     def _prepare(self, assignment: Assignment, T_world_camera: Transform, changes: Iterable[Command]) -> DepthPipeline:
         """The pipeline as assignment and commands have it; without one, nothing can be changed."""

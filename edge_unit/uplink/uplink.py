@@ -23,7 +23,7 @@ import logging
 import random
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from edge_unit.joints import JointHistory
 from edge_unit.pipeline import SeenBlocks
@@ -40,6 +40,7 @@ from shared.messages import (
     CONTRACT_VERSION,
     DONE,
     MAX_COMMANDS,
+    MAX_TEXT,
     CellReference,
     Command,
     Ended,
@@ -48,8 +49,10 @@ from shared.messages import (
     Outcome,
     Phase,
     PoseQuality,
+    Progress,
     SeenReport,
     ToldOrigin,
+    TroubleCode,
     UpdateAnswer,
     UpdateRequest,
     Versions,
@@ -107,6 +110,18 @@ class Report:
     stages_ns: dict[str, int] = field(default_factory=dict)
 
 
+class Trouble(NamedTuple):
+    """Why a unit reports no voxels: a code, a sentence, and how far it is with what is to be waited for."""
+
+    code: TroubleCode
+    sentence: str
+    progress: Progress | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """The fields of `Health` that tell it; a sentence that is too long is cut."""
+        return {"trouble": self.sentence[:MAX_TEXT], "trouble_code": self.code, "progress": self.progress}
+
+
 class Delivery(NamedTuple):
     """When a report was sent, when the master had all of it, and when it had merged it: by the unit's clock, in ns."""
 
@@ -158,7 +173,7 @@ class Uplink:
         self.commands: asyncio.Queue[Command] = asyncio.Queue(MAX_COMMANDS)
         self.joints = JointHistory()
         self.clock = ClockOffset()
-        self.trouble: str | None = None
+        self.trouble: Trouble | None = None
         self.warning: str | None = None
 
     # ------------------------------------------------------------------ what the unit calls
@@ -354,7 +369,7 @@ class Uplink:
             # Made for a session that is over, in which the same versions may have meant something else.
             if fresh is not None:
                 self._on_sent(fresh, None)
-            report = Report(assignment, health=Health(trouble=self.trouble))
+            report = Report(assignment)
         self._last = report
         try:
             answer, delivery = await self._exchange_update(assignment, report)
@@ -386,10 +401,10 @@ class Uplink:
             self._acknowledged = None
         done = tuple(self._done[:MAX_COMMANDS])
         health = report.health
-        if self.trouble is not None or self.warning is not None:
-            health = health.model_copy(
-                update={"trouble": self.trouble or health.trouble, "warning": self.warning or health.warning}
-            )
+        if self.trouble is not None:
+            health = health.model_copy(update=self.trouble.facts())
+        if self.warning is not None:
+            health = health.model_copy(update={"warning": self.warning})
         sent_at_ns = monotonic_ns()
         answer = await self._client.update(
             UpdateRequest(

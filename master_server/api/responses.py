@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 
 from master_server.core import MapView, Readable
 from shared.lattice import Lattice
-from shared.messages import LatticeDescription, State, VoxelsAnswer
+from shared.messages import LatticeDescription, Reason, State, VoxelsAnswer
 
 Form = Literal["indices", "centres", "keys"]
 
@@ -31,6 +31,7 @@ class UnitState(BaseModel):
     ip: str
     state: State
     reason: str
+    cause: Reason | None = Field(default=None, description="The reason for programs.")
     age_s: float | None = Field(description="Since the capture of its last frame.")
     voxels: int
 
@@ -58,6 +59,7 @@ class CoverageAnswer(BaseModel):
     block_size_m: float
     complete: bool = Field(description="As in `GET /voxels`.")
     reasons: list[str]
+    causes: list[Reason] = Field(default=[], description="As in `GET /voxels`.")
     units_live: int
     now_ns: int
     blocks: BlockCounts | None = None
@@ -72,6 +74,7 @@ def map_fields(view: MapView, form: Form, unseen: dict[str, Any] | None, now_ns:
         "witnesses": np.ascontiguousarray(view.witnesses),
         "complete": view.complete,
         "reasons": list(view.reasons),
+        "causes": list(view.causes),
         "oldest_view_age_s": None if view.oldest_view_age_s is None else round(view.oldest_view_age_s, 4),
         "units_live": view.units_live,
         "now_ns": now_ns,
@@ -101,6 +104,7 @@ def coverage_fields(master: Readable, with_blocks: bool, now_ns: int) -> dict[st
         "block_size_m": blocks.voxel_size_m,
         "complete": view.complete,
         "reasons": list(view.reasons),
+        "causes": list(view.causes),
         "units_live": view.units_live,
         "now_ns": now_ns,
         "blocks": _block_counts(blocks, seen_by) if with_blocks else None,

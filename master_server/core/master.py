@@ -19,7 +19,7 @@ from master_server.cells.published import PublishedCell
 from master_server.core.coverage import Coverage, blocks_of
 from master_server.core.merged_map import NO_KEYS, MergedMap
 from master_server.core.robot_joints import RobotJoints
-from master_server.core.units import Registry, Slot
+from master_server.core.units import Registry, Slot, sentence_of
 from master_server.persistence import Store, beginning
 from shared.cell import Cell
 from shared.configuration import sentence
@@ -37,6 +37,8 @@ from shared.messages import (
     Matrix,
     PoseOrigin,
     PoseQuality,
+    Reason,
+    ReasonCode,
     RobotAnswer,
     State,
     UnitRow,
@@ -58,7 +60,8 @@ logger = logging.getLogger(__name__)
 class MapView:
     """The merged map at one time: keys (N,) uint32 ascending, witnesses (N,) uint8; and whether it is all there is.
 
-    `reports` are the keys of each live unit by its id, of which it was merged.
+    `reports` are the keys of each live unit by its id, of which it was merged; `causes` the reasons for programs, in
+    the same order (recordings of contract 5.0 have none).
     """
 
     lattice: Lattice
@@ -69,6 +72,7 @@ class MapView:
     oldest_view_age_s: float | None
     units_live: int
     reports: Mapping[int, NDArray[np.uint32]] = field(default_factory=dict)
+    causes: tuple[Reason, ...] = ()
 
     @property
     def complete(self) -> bool:
@@ -170,12 +174,12 @@ class Master:
         self._changed()
         return self._answer(slot, update, now_ns)
 
-    def judge(self, slot: Slot, now_ns: int) -> tuple[State, str]:
-        """A unit's state now, and why in words; a state other than the last one found is logged."""
-        state, reason = slot.judge(now_ns, self.versions, self.settings)
+    def judge(self, slot: Slot, now_ns: int) -> tuple[State, Reason | None]:
+        """A unit's state now, and why; a state other than the last one found is logged."""
+        state, cause = slot.judge(now_ns, self.versions, self.settings)
         if state != slot.told_state:
-            slot.tell(state, reason)
-        return state, reason
+            slot.tell(state, cause)
+        return state, cause
 
     def units(self, now_ns: int) -> list[UnitRow]:
         """One row a unit."""
@@ -187,17 +191,18 @@ class Master:
         return rows
 
     def unit_states(self, now_ns: int) -> list[dict[str, Any]]:
-        """Of each row what a stream tells at every change: id, ip, state, reason, age and voxels."""
+        """Of each row what a stream tells at every change: id, ip, state, reason, cause, age and voxels."""
         rows = []
         for slot in self.registry:
-            state, reason = self.judge(slot, now_ns)
+            state, cause = self.judge(slot, now_ns)
             age_s = slot.age_s(now_ns)
             rows.append(
                 {
                     "id": slot.id,
                     "ip": slot.ip,
                     "state": state,
-                    "reason": reason,
+                    "reason": sentence_of(cause),
+                    "cause": cause,
                     "age_s": None if age_s is None else round(age_s, 4),
                     "voxels": len(slot.keys),
                 }
@@ -248,33 +253,35 @@ class Master:
 
     def view(self, now_ns: int) -> MapView:
         """The union of what live units report, and what it lacks (Algorithm 9)."""
-        reasons = []
+        causes = []
         ages_s = []
         for slot in self.registry:
-            state, reason = self.judge(slot, now_ns)
+            state, cause = self.judge(slot, now_ns)
             if state != "live":
+                assert cause is not None
                 self.map.withdraw(slot.id)
-                reasons.append(f"unit {slot.id} ({slot.ip}) is {state}: {reason}")
+                causes.append(_of_unit(slot, cause.code, f"is {state}: {cause.sentence}", cause.numbers))
                 continue
             self.map.replace(slot.id, slot.keys)
             ages_s.append(slot.age_s(now_ns) or 0.0)
             if not self.coverage.has(slot.id):
-                reasons.append(f"unit {slot.id} ({slot.ip}) has not reported what it looks through")
+                causes.append(_of_unit(slot, "not_seen", "has not reported what it looks through"))
         if not len(self.registry):
-            reasons.append("there is no unit")
-        robot_state, robot_reason = self.robot.state(now_ns, self.settings.robot_stale_after_s)
-        if robot_state not in ("fresh", "none"):
-            reasons.append(robot_reason)
+            causes.append(Reason("no_unit", "there is no unit"))
+        _, robot_cause = self.robot.state(now_ns, self.settings.robot_stale_after_s)
+        if robot_cause is not None:
+            causes.append(robot_cause)
         keys, witnesses = self.map.voxels()
         return MapView(
             self.lattice,
             self.versions.lattice,
             keys,
             witnesses,
-            tuple(reasons),
+            tuple(cause.sentence for cause in causes),
             max(ages_s, default=None),
             len(ages_s),
             self.map.reports(),
+            tuple(causes),
         )
 
     def seen_by(self, now_ns: int) -> NDArray[np.uint8]:
@@ -302,13 +309,13 @@ class Master:
 
     def robot_answer(self, since_ns: int | None, now_ns: int) -> RobotAnswer:
         """The newest joints, or all after `since_ns`."""
-        state, reason = self.robot.state(now_ns, self.settings.robot_stale_after_s)
+        state, cause = self.robot.state(now_ns, self.settings.robot_stale_after_s)
         age_s = self.robot.age_s(now_ns)
         newest = self.robot.newest
         samples = self.robot.since(since_ns) if since_ns is not None else () if newest is None else (newest,)
         return RobotAnswer(
             state=state,
-            reason=reason,
+            reason=sentence_of(cause),
             joint_names=self.robot.joint_names or (),
             age_s=None if age_s is None else round(age_s, 4),
             now_ns=now_ns,
@@ -454,3 +461,8 @@ class Master:
     def _versions_for(self, slot: Slot) -> Versions:
         ours = self.versions
         return Versions(settings=ours.settings, lattice=ours.lattice, cell=ours.cell, pose=slot.pose_version)
+
+
+def _of_unit(slot: Slot, code: ReasonCode, what: str, numbers: Mapping[str, float] | None = None) -> Reason:
+    """A reason that is about one unit."""
+    return Reason(code, f"unit {slot.id} ({slot.ip}) {what}", {"unit": float(slot.id), **(numbers or {})})

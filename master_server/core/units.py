@@ -29,6 +29,8 @@ from shared.messages import (
     Phase,
     PoseOrigin,
     PoseQuality,
+    Reason,
+    ReasonCode,
     State,
     UnitRow,
     Verb,
@@ -62,6 +64,9 @@ MOVED_AGREEING_SHARE = 0.1
 
 MOVED_STATIC_SHARE = 0.1
 """With fewer pixels before known surfaces there is nothing to tell a moved camera by."""
+
+SILENT: tuple[ReasonCode, ...] = ("no_update", "late_update")
+"""Nothing is heard of the unit: what it said before counts for nothing."""
 
 COMMAND_EXPIRES_S = 600.0
 """Learning the background at one frame a second takes minutes; what is not answered after ten of them never will be."""
@@ -203,12 +208,13 @@ class Slot:
         newest_ns = min(self.arrived_at_ns, self.captured_at_ns + self.clock.offset_ns)
         return newest_ns + round(stale_after_s * NS_PER_S)
 
-    def tell(self, state: State, reason: str) -> None:
+    def tell(self, state: State, cause: Reason | None) -> None:
         """Log that its state is another one."""
+        reason = sentence_of(cause)
         level = logging.INFO if state == "live" else logging.WARNING
         before = f"{self.told_state} → " if self.told_state else ""
         why = f": {reason}" if reason else ""
-        fields = {**self.log_fields("state"), "state": state, "reason": reason}
+        fields = {**self.log_fields("state"), "state": state, "reason": reason, "code": cause.code if cause else ""}
         logger.log(level, "unit %d (%s): %s%s%s", self.id, self.ip, before, state, why, extra=fields)
         self.told_state = state
 
@@ -228,32 +234,36 @@ class Slot:
             return 0.0
         return (len(captures) - 1) * NS_PER_S / (captures[-1] - captures[0])
 
-    def judge(self, now_ns: int, current: Versions, settings: Settings) -> tuple[State, str]:
-        """The unit's state, and the reason in words when it is not live, or a warning when it is.
+    def judge(self, now_ns: int, current: Versions, settings: Settings) -> tuple[State, Reason | None]:
+        """The unit's state, and the reason when it is not live, or a warning when it is.
 
         `current` has the versions of the master; its pose counts for nothing, each slot has its own.
         """
         if self.T_world_camera is None:
-            return "uncalibrated", self.record.note or self.health.trouble or "its pose is not known yet"
+            return "uncalibrated", self._without_pose()
         if stale := self._stale(now_ns, current, settings):
-            trouble = f" ({self.health.trouble})" if self.health.trouble else ""
-            return "stale", stale + trouble
+            return "stale", self._with_trouble(stale)
         health = self.health
         if health.trouble:
-            return "blind", health.trouble
+            return "blind", self._trouble(health.trouble)
         if health.blind:
-            return "blind", health.blind
+            return "blind", Reason("covered", health.blind)
         if health.valid_share < BLIND_VALID_SHARE:
-            return "blind", f"only {health.valid_share:.0%} of its pixels measure anything"
+            numbers = {"valid_share": health.valid_share, "limit_share": BLIND_VALID_SHARE}
+            text = f"only {health.valid_share:.0%} of its pixels measure anything"
+            return "blind", Reason("few_pixels", text, numbers)
         if health.moved:
-            return "moved", health.moved
+            return "moved", Reason("moved", health.moved)
         if health.static_share >= MOVED_STATIC_SHARE and health.agreeing_share < MOVED_AGREEING_SHARE:
-            return "moved", f"only {health.agreeing_share:.0%} of the known surfaces are where they should be"
+            numbers = {"agreeing_share": health.agreeing_share, "limit_share": MOVED_AGREEING_SHARE}
+            text = f"only {health.agreeing_share:.0%} of the known surfaces are where they should be"
+            return "moved", Reason("few_surfaces", text, numbers)
         if self.warning:
-            return "live", f"{self.warning}; {health.warning}" if health.warning else self.warning
-        return "live", health.warning or ""
+            text = f"{self.warning}; {health.warning}" if health.warning else self.warning
+            return "live", Reason("pose_differs", text)
+        return "live", Reason("warning", health.warning) if health.warning else None
 
-    def row(self, now_ns: int, state: State, reason: str, range_m: float | None) -> UnitRow:
+    def row(self, now_ns: int, state: State, cause: Reason | None, range_m: float | None) -> UnitRow:
         """What `GET /units` tells."""
         self.expire(now_ns)
         age_s, arrival_age_s = self.age_s(now_ns), self.arrival_age_s(now_ns)
@@ -265,7 +275,8 @@ class Slot:
             model=self.record.model,
             software=self.record.software,
             state=state,
-            reason=reason,
+            reason=sentence_of(cause),
+            cause=cause,
             phase=self.phase,
             age_s=None if age_s is None else round(age_s, 4),
             arrival_age_s=None if arrival_age_s is None else round(arrival_age_s, 4),
@@ -285,32 +296,64 @@ class Slot:
             last_command=self.last_command,
         )
 
-    def _stale(self, now_ns: int, current: Versions, settings: Settings) -> str:
-        """Why its last view says nothing about now; empty when it does."""
+    def _without_pose(self) -> Reason:
+        """Why it is not known where its camera is."""
+        if self.record.note:
+            is_old = self.health.trouble_code == "contract"
+            return Reason("contract" if is_old else "pose_void", self.record.note)
+        if self.health.trouble:
+            return self._trouble(self.health.trouble)
+        return Reason("no_pose", "its pose is not known yet")
+
+    def _trouble(self, sentence: str) -> Reason:
+        """What the unit says is wrong, and how far it is with what is to be waited for."""
+        progress = self.health.progress
+        numbers = {"done": float(progress.done), "total": float(progress.total)} if progress else {}
+        return Reason(self.health.trouble_code or "trouble", sentence, numbers)
+
+    def _with_trouble(self, stale: Reason) -> Reason:
+        """The same with what the unit said was wrong; one that does not understand its master is not merely late."""
+        trouble = self.health.trouble
+        if not trouble:
+            return stale
+        is_old = self.health.trouble_code == "contract" and stale.code not in SILENT
+        return Reason("contract" if is_old else stale.code, f"{stale.sentence} ({trouble})", stale.numbers)
+
+    def _stale(self, now_ns: int, current: Versions, settings: Settings) -> Reason | None:
+        """Why its last view says nothing about now; None when it does."""
         limit_s = settings.stale_after_s
         arrival_age_s, age_s = self.arrival_age_s(now_ns), self.age_s(now_ns)
         uncertainty_ns = self.clock_uncertainty_ns(now_ns)
         if arrival_age_s is None:
-            return "no update since it registered" if self.registered else "no update since the master started"
+            since = "it registered" if self.registered else "the master started"
+            return Reason("no_update", f"no update since {since}")
         if arrival_age_s > limit_s:
-            return f"its last update came {arrival_age_s:.1f} s ago, at most {limit_s:g} s are trusted"
+            text = f"its last update came {arrival_age_s:.1f} s ago, at most {limit_s:g} s are trusted"
+            return Reason("late_update", text, {"age_s": round(arrival_age_s, 1), "limit_s": limit_s})
         if self.captured_at_ns is None:
-            return "no frame yet"
+            return Reason("no_frame", "no frame yet")
         if age_s is None or uncertainty_ns is None:
-            return "its clock is not known yet"
+            return Reason("clock_unknown", "its clock is not known yet")
         if uncertainty_ns > limit_s * NS_PER_S:
-            return f"its clock is known to {uncertainty_ns / NS_PER_S:.1f} s only"
+            text = f"its clock is known to {uncertainty_ns / NS_PER_S:.1f} s only"
+            numbers = {"uncertainty_s": round(uncertainty_ns / NS_PER_S, 1), "limit_s": limit_s}
+            return Reason("clock_uncertain", text, numbers)
         if age_s > limit_s:
-            return f"its last frame is {age_s:.1f} s old, at most {limit_s:g} s are trusted"
+            text = f"its last frame is {age_s:.1f} s old, at most {limit_s:g} s are trusted"
+            return Reason("late_frame", text, {"age_s": round(age_s, 1), "limit_s": limit_s})
         if age_s * NS_PER_S < -(uncertainty_ns + FUTURE_TOLERANCE_NS):
-            return f"its last frame seems to be of {-age_s:.3f} s from now: its clock jumped"
+            text = f"its last frame seems to be of {-age_s:.3f} s from now: its clock jumped"
+            return Reason("clock_jumped", text, {"ahead_s": round(-age_s, 3)})
         if self.versions.lattice != current.lattice:
-            return "it does not work on the current lattice yet"
+            text = "it does not work on the current lattice yet"
+            return _behind("old_lattice", text, self.versions.lattice, current.lattice)
         if self.versions.cell != current.cell:
-            return "it does not work with the current cell yet"
+            text = "it does not work with the current cell yet"
+            return _behind("old_cell", text, self.versions.cell, current.cell)
         if self.versions.pose != self.pose_version:
-            return "it does not work with its current pose yet"
-        return ""
+            text = "it does not work with its current pose yet"
+            return _behind("old_pose", text, self.versions.pose, self.pose_version)
+        return None
 
 
 class Registry:
@@ -462,6 +505,16 @@ class Registry:
 
     def _drop(self, slot: Slot) -> None:
         del self._slots[slot.id], self._by_ip[slot.ip]
+
+
+def sentence_of(cause: Reason | None) -> str:
+    """A reason in words; empty where there is none."""
+    return "" if cause is None else cause.sentence
+
+
+def _behind(code: ReasonCode, sentence: str, version: int, current: int) -> Reason:
+    """A unit that works with a version that is not the current one."""
+    return Reason(code, sentence, {"version": float(version), "current": float(current)})
 
 
 def _registered(request: InitializeRequest, ip: str, before: UnitRecord | int, elsewhere: Iterable[Slot]) -> UnitRecord:

@@ -23,7 +23,7 @@ from shared.settings import Settings
 SPEED_MIN, SPEED_MAX = 0.01, 100.0
 """From where the robot's single steps are seen to where a shift passes in five minutes."""
 
-STREAMED = {"id", "ip", "state", "reason", "age_s", "voxels"}
+STREAMED = {"id", "ip", "state", "reason", "cause", "age_s", "voxels"}
 
 LOOK_PERIOD_NS = 10 * NS_PER_MS
 """Listeners are woken at most this often, however fast it plays."""

@@ -27,8 +27,10 @@ from shared.messages import (
     LatticeDescription,
     Outcome,
     OutcomeCode,
+    Progress,
     RobotAnswer,
     SeenReport,
+    TroubleCode,
     UpdateAnswer,
     UpdateRequest,
     Versions,
@@ -106,7 +108,7 @@ def test_the_names_on_the_wire_are_those_of_the_contract() -> None:
         "joints_until_ns", "done",
     ]  # fmt: skip
     assert fields["versions"] == [1000, 1000, 1000, 1000]
-    assert fields["health"] == [0.87, 0.95, -0.01, 0.5, 8.1, 10**7, None, None, None, None]
+    assert fields["health"] == [0.87, 0.95, -0.01, 0.5, 8.1, 10**7, *[None] * 6]
     assert fields["keys"][:8] == b"\x05\x00\x00\x00\x06\x00\x00\x00"
 
 
@@ -213,6 +215,10 @@ def test_bad_seen_reports_are_refused(shape: tuple[int, int, int], bits: bytes) 
         ({"health": [float("nan"), 0.5, 0.0, 0.5, 1.0, 1, None, None, None, None]}, "health.valid_share"),
         ({"health": [1.1, 0.5, 0.0, 0.5, 1.0, 1, None, None, None, None]}, "health.valid_share"),
         ({"health": [0.5, 0.5, 0.0, 0.5, 1.0, 1, "x" * 201, None, None, None]}, "health.trouble"),
+        ({"health": [0.5, 0.5, 0.0, 0.5, 1.0, 1, *[None] * 7]}, "health: expected an array of 10 to 12 values"),
+        ({"health": [0.5, 0.5, 0.0, 0.5, 1.0, 1, *[None] * 4, "bored"]}, "health.trouble_code"),
+        ({"health": [0.5, 0.5, 0.0, 0.5, 1.0, 1, *[None] * 5, ["background", 1]]}, "health.progress.total"),
+        ({"health": [0.5, 0.5, 0.0, 0.5, 1.0, 1, *[None] * 5, ["background", 1, 2, 3]]}, "health: expected a progress"),
         ({"health": [0.5] * 9}, "health: expected an array of 10"),
         ({"seen": {"block_size_m": 0.1, "shape": [1, 1, 0], "bits": b""}}, "seen.shape"),
         ({"seen": {"block_size_m": 0.1, "shape": [1, 1, 1], "bits": b"x" * (MAX_SEEN_BYTES + 1)}}, "seen.bits"),
@@ -310,6 +316,14 @@ NUMBERS = st.floats(allow_nan=False, allow_infinity=False, width=32)
 VERSIONS = st.builds(Versions, settings=COUNTS, lattice=COUNTS, cell=COUNTS, pose=COUNTS)
 TEXTS = st.text(st.characters(exclude_categories=("Cs",)), max_size=200)
 OUTCOMES = (None, *get_args(OutcomeCode))
+HEALTH = st.builds(
+    Health,
+    valid_share=st.floats(0.0, 1.0),
+    frame=COUNTS,
+    trouble=st.none() | TEXTS,
+    trouble_code=st.sampled_from((None, *get_args(TroubleCode))),
+    progress=st.none() | st.builds(Progress, task=st.just("background"), done=COUNTS, total=COUNTS),
+)
 UPDATES = st.builds(
     UpdateRequest,
     id=COUNTS,
@@ -320,7 +334,14 @@ UPDATES = st.builds(
     exchange=st.none() | st.builds(Exchange, TIMES, TIMES, TIMES, TIMES),
     versions=VERSIONS,
     keys=st.binary(max_size=80),
-    health=st.builds(Health, valid_share=st.floats(0.0, 1.0), frame=COUNTS, trouble=st.none() | TEXTS),
+    health=st.builds(
+        Health,
+        valid_share=st.floats(0.0, 1.0),
+        frame=COUNTS,
+        trouble=st.none() | TEXTS,
+        trouble_code=st.sampled_from((None, *get_args(TroubleCode))),
+        progress=st.none() | st.builds(Progress, task=st.just("background"), done=COUNTS, total=COUNTS),
+    ),
     joints_until_ns=TIMES,
     done=st.lists(st.builds(Ended, COUNTS, TEXTS, st.sampled_from(OUTCOMES)), max_size=3).map(tuple),
 )

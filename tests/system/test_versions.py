@@ -188,6 +188,17 @@ async def test_a_unit_ignores_what_it_need_not_know_of_a_newer_master(table: Tab
     assert decode_update_answer(msgpack.packb(update)).versions == Versions(settings=1, lattice=1, cell=1)
 
 
+async def test_a_unit_of_5_0_has_reasons_without_numbers(table: Table) -> None:
+    told = {step.name: plain(step) for step in await table.replay(recorded("5.0")) if not step.is_units}
+    learning = told["readers ask for the units that learn"][0]
+    assert learning["cause"] == {"code": "trouble", "sentence": learning["reason"], "numbers": {}}
+    assert (learning["health"]["progress"], learning["contract_minor"]) == (None, 0)
+    incomplete = told["readers ask for a map that is not complete"]
+    assert [cause["code"] for cause in incomplete["causes"]] == ["trouble"]
+    assert incomplete["causes"][0]["numbers"] == {"unit": 1.0}
+    assert [cause["sentence"] for cause in incomplete["causes"]] == incomplete["reasons"]
+
+
 def worse(step: Step, *path: str) -> bytes:
     """An answer with a name more in one of its parts."""
     fields = part = plain(step)

@@ -12,9 +12,10 @@ from edge_unit.daemon.background_learning import Learning
 from edge_unit.daemon.background_store import BackgroundStore, Place
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.sources.frame import CameraInfo
+from edge_unit.uplink.uplink import Trouble
 from shared.camera import Intrinsics
 from shared.cell import Cell
-from shared.messages import Command, Outcome, OutcomeCode
+from shared.messages import Command, Outcome, OutcomeCode, Progress
 from shared.transforms import look_at
 
 CAMERA = Intrinsics(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -38,7 +39,7 @@ class Student:
         self.told.append((command.id, outcome.code))
         self.details.append(outcome.detail)
 
-    def add(self) -> str | None:
+    def add(self) -> Trouble | None:
         return self.learning.add(self.pipeline, PLACE, DEPTH, None)
 
 
@@ -46,7 +47,10 @@ def test_what_was_learned_is_found_again_and_stays_dropped(tmp_path: Path) -> No
     one = Student(tmp_path, frames=2)
     one.learning.find(one.pipeline, PLACE)
     assert one.learning.progress == (0, 2)
-    assert one.add() == "learning the background: frame 1 of 2"
+    learning = one.add()
+    assert learning is not None
+    assert (learning.code, learning.progress) == ("background", Progress(task="background", done=1, total=2))
+    assert "frame 1 of 2" in learning.sentence
     assert one.add() is None
     assert one.learning.progress is None
     assert one.pipeline.reference is not None

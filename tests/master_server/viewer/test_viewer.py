@@ -253,12 +253,14 @@ def test_a_view_is_that_of_its_own_camera() -> None:
 
 def test_who_learns_shows_how_far_it_is() -> None:
     row = {
-        "id": 1, "ip": "10.0.0.1", "state": "blind", "reason": "learning the background: frame 12 of 60", "age_s": 0.1,
+        "id": 1, "ip": "10.0.0.1", "state": "blind", "reason": "frame 12 of 60", "age_s": 0.1,
         "fps": 15.0, "process_ms": 5.0, "voxels": 0, "last_command": None,
         "health": {"valid_share": 0.9, "agreeing_share": 0.0, "static_share": 0.0},
     }  # fmt: skip
-    assert '<progress value="12" max="60"></progress>' in table_html([row])
-    assert "<progress" not in table_html([row | {"reason": "frame 12 of 60"}])
+    health = row["health"] | {"progress": {"task": "background", "done": 12, "total": 60}}
+    assert '<progress value="12" max="60"></progress>' in table_html([row | {"health": health}])
+    # A unit of contract 5.0, or a recording of one, tells it to people only.
+    assert "<progress" not in table_html([row | {"reason": "learning the background: frame 12 of 60"}])
 
 
 async def test_the_last_minutes_are_there_for_who_asks() -> None:

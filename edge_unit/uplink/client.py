@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 import httpx
 
 from edge_unit.tls import tls_context
-from shared.errors import ConfigError, MasterRefused, MasterUnreachable, WireError
+from shared.errors import ConfigError, MasterRefused, MasterUnreachable, NewerContract, WireError
 from shared.messages import (
     CONTRACT_MINOR,
     CONTRACT_VERSION,
@@ -24,6 +24,7 @@ from shared.messages import (
     PoseQuality,
     PoseRequest,
     RobotAnswer,
+    SlotAnswer,
     UpdateAnswer,
     UpdateRequest,
 )
@@ -125,13 +126,24 @@ class MasterClient:
         self._http.headers["Authorization"] = f"Bearer {token}"
 
     async def initialize(self, request: InitializeRequest) -> InitializeAnswer:
-        """Ask for a slot. Raises as `update`; a master of an older contract than the unit's has refused."""
+        """Ask for a slot.
+
+        Raises as `update`, and besides:
+            MasterRefused: the master speaks an older contract than the unit.
+            NewerContract: it speaks a newer one, and asks what this unit does not know.
+        """
         try:
-            answer = decode(InitializeAnswer, await self._call("POST", "/initialize", encode(request)))
+            data = await self._call("POST", "/initialize", encode(request))
         except MasterRefused as error:
             # All that a master of contract 5.0 has to say of a minor number.
             if error.status == 422 and error.detail.startswith("contract_minor:"):
                 raise self._older(0) from error
+            raise
+        try:
+            answer = decode(InitializeAnswer, data)
+        except WireError as error:
+            if decode(SlotAnswer, data).contract_minor > CONTRACT_MINOR:
+                raise NewerContract(str(error), data) from error
             raise
         if answer.contract_minor < request.contract_minor:
             raise self._older(answer.contract_minor)

@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import json
 import sqlite3
+from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,16 +15,22 @@ from typing import Any
 
 import httpx
 import msgpack
+import numpy as np
 import pytest
 
+from edge_unit.sources.frame import CameraInfo
+from edge_unit.uplink.cell_cache import CellCache
 from edge_unit.uplink.client import MasterClient
 from edge_unit.uplink.master_selection import Wanted, objection
-from edge_unit.uplink.uplink import NOT_OURS
+from edge_unit.uplink.uplink import NOT_OURS, Uplink
+from master_server.app import make_app
 from master_server.core import Master
 from master_server.persistence import Store
 from master_server.recording.moment import StateRecord
+from master_server.security import Access
 from shared.camera import Intrinsics
 from shared.cell import Cell
+from shared.clock import monotonic_ns
 from shared.discovery import Announcement, offer_of
 from shared.errors import CellError, MasterRefused, WireError
 from shared.messages import (
@@ -38,7 +47,7 @@ from shared.messages import (
 )
 from shared.settings import Settings
 from shared.wire import decode, decode_update, decode_update_answer, encode, unpack
-from tests.system.conversation import GOLDEN, UNIT, Step, Table, plain, recorded, recorded_cell
+from tests.system.conversation import GOLDEN, OPERATOR, UNIT, Step, Table, plain, recorded, recorded_cell
 
 ANSWERS = {"/initialize": InitializeAnswer, "/robot": RobotAnswer, "/units/1/pose": PoseAnswer}
 """What a unit reads, by path; beside the answers to updates, and the cell."""
@@ -236,6 +245,90 @@ def test_a_unit_refuses_a_cell_of_which_it_does_not_know_all() -> None:
             Cell.from_document(document, meshes)
         del part["newer"]
     assert Cell.from_document(document, meshes).name == "golden"
+
+
+class NewerMaster(httpx.AsyncBaseTransport):
+    """A master of the next minor: that of now, whose answers at `paths` have a name more in one of their parts."""
+
+    def __init__(self, master: Master, *paths: tuple[str, str]) -> None:
+        app = make_app(master, Access(UNIT.encode(), OPERATOR.encode()))
+        self._transport = httpx.ASGITransport(app=app, client=("10.0.0.1", 40_000))
+        self.newer = dict(paths)
+
+    async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
+        response = await self._transport.handle_async_request(request)
+        data = await response.aread()
+        if response.status_code != 200 or request.url.path.startswith("/cell/meshes/"):
+            return httpx.Response(response.status_code, content=data)
+        fields = msgpack.unpackb(data)
+        if request.url.path == "/initialize":
+            fields["contract_minor"] += 1
+        part = self.newer.get(request.url.path)
+        if part is not None and fields.get(part):
+            fields[part]["newer"] = 1
+        return httpx.Response(200, content=msgpack.packb(fields))
+
+
+@contextlib.asynccontextmanager
+async def unit_of(transport: NewerMaster, folder: Path) -> AsyncIterator[Uplink]:
+    """An uplink of now at this master, whose camera's pose is known."""
+    client = MasterClient("http://master", lambda: UNIT, transport=transport)
+    uplink = Uplink(client, CellCache(folder), "unit of now", "boot", lambda report, delivery: None)
+    uplink.set_camera(CameraInfo("A", "model", Intrinsics(8, 6, 10.0, 10.0, 4.0, 3.0)), (np.eye(4), "configured"))
+    async with client:
+        task = asyncio.create_task(uplink.run())
+        yield uplink
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def until(look: Callable[[], bool]) -> None:
+    deadline_ns = monotonic_ns() + 10 * 10**9
+    while not look():
+        assert monotonic_ns() < deadline_ns
+        await asyncio.sleep(0.005)
+
+
+def codes(master: Master) -> list[str]:
+    return [cause.code for cause in master.view(monotonic_ns()).causes]
+
+
+@pytest.mark.parametrize("path", [("/initialize", "settings"), ("/initialize", "lattice"), ("/cell", "board")])
+async def test_a_unit_that_does_not_understand_its_master_says_so_until_it_does(
+    tmp_path: Path, path: tuple[str, str]
+) -> None:
+    document, meshes = recorded_cell("5.0")
+    document["robot"] = None
+    one = Master(Cell.from_document(document, meshes), Settings())
+    transport = NewerMaster(one, path)
+    async with unit_of(transport, tmp_path) as uplink:
+        await until(lambda: codes(one) == ["contract"])
+        (row,) = one.units(monotonic_ns())
+        assert row.cause is not None
+        assert "update this unit" in row.reason
+        assert "newer" in row.reason
+        assert "update this unit" in uplink.standing
+        assert uplink.assignment is None
+        # What it did not understand is taken back.
+        transport.newer.clear()
+        one.change_settings({"stale_after_s": 0.6})
+        await until(lambda: uplink.assignment is not None)
+        await until(lambda: codes(one) == ["no_frame"])
+        assert uplink.assignment is not None
+        assert uplink.assignment.settings.stale_after_s == 0.6
+
+
+async def test_a_unit_follows_a_newer_master_until_that_asks_what_it_does_not_know(tmp_path: Path) -> None:
+    document, meshes = recorded_cell("5.0")
+    document["robot"] = None
+    one = Master(Cell.from_document(document, meshes), Settings())
+    transport = NewerMaster(one)
+    async with unit_of(transport, tmp_path) as uplink:
+        await until(lambda: codes(one) == ["no_frame"])
+        transport.newer = {"/update": "settings", "/initialize": "settings"}
+        one.change_settings({"stale_after_s": 0.6})
+        await until(lambda: codes(one) == ["contract"])
+        assert uplink.assignment is None
 
 
 def test_a_master_of_5_0_announces_itself_without_a_minor() -> None:

@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-accuracy bench-pipeline bench-board bench-master bench-scale bench-latency soak bench-pose-monitor bench-paper viewer-test rehearsal image-test pictures test lint clean
+.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-accuracy bench-pipeline bench-board bench-master bench-scale bench-latency soak bench-pose-monitor bench-paper viewer-test rehearsal image-test fresh-machine pictures test lint clean
 
 ARGS ?=
 MINUTES ?= 30
@@ -89,6 +89,9 @@ rehearsal: $(READY) ## a master and three units as machines that boot from what 
 image-test: $(READY) ## two arm64 boards boot from one image, find a master and report to it (root, QEMU)
 	@$(BIN)/python -m qualification.image $(ARGS)
 
+fresh-machine: $(READY) ## demo and test on Debians that have only Python, its venv and make (root, mmdebstrap)
+	@$(BIN)/python -m qualification.fresh_machine $(ARGS)
+
 pictures: $(READY) ## the pictures of the README, painted anew
 	@$(BIN)/python -m simulation.demo.picture assets/pictures/demo.png
 	@$(BIN)/python -m simulation.demo.window_pictures assets/pictures
@@ -99,15 +102,12 @@ test: $(READY) lint ## lint, then all tests but the slow ones; with SLOW=1 these
 	$(PYTEST) -m "alone$(if $(SLOW),, and not slow)" $(ARGS) || [ $$? -eq $(NO_TESTS) ] || failed=1; \
 	exit $$failed
 
-# JetPack 6 has Python 3.10: a second look sees what that has not. numpy's types are written for later ones, so there
-# they are partly unknown, and what is told of that kind is left to the first look. Each has a cache of its own.
 lint: $(READY) ## ruff, and mypy for this Python and for 3.10
 	@failed=0; \
 	$(BIN)/ruff check -q . || failed=1; \
 	$(BIN)/ruff format -q --check . || failed=1; \
 	$(if $(TYPED),$(BIN)/mypy --no-error-summary $(TYPED) || failed=1; \
-	$(BIN)/mypy --no-error-summary --python-version 3.10 --cache-dir .mypy_cache/py310 \
-	    --no-warn-return-any --no-warn-unused-ignores $(TYPED) || failed=1;) \
+	$(BIN)/mypy --no-error-summary --config-file scripts/mypy-3.10.ini $(TYPED) || failed=1;) \
 	exit $$failed
 
 clean: ## takes out .venv and all caches

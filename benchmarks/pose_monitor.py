@@ -82,8 +82,8 @@ class Watch:
         if hidden:
             depth = depth.copy()
             depth[:, : round(hidden * self.intrinsics.width)] = 0
-        self.pipeline.process(depth, frame.joints)
-        verdict = self.stance.judge(self.pipeline.misfit(), self.pipeline.static_version, round(self.t_s * 1e9))
+        found = self.pipeline.process(depth, frame.joints, with_misfit=True)
+        verdict = self.stance.watch(found.misfit, self.pipeline.static_version, round(self.t_s * 1e9))
         self.t_s += PERIOD_S
         return verdict.reason
 

@@ -147,7 +147,7 @@ def judge(frames: RealFrames, maps: dict[int, SeenMap], recorded: dict[int, Seen
     same = True
     for frame in WATCHED_FRAMES:
         seen = maps[frame]
-        found = frames.pipeline.process(frames.depth[frame], frames.joints[frame])
+        found = frames.pipeline.process(frames.depth[frame], frames.joints[frame]).voxels
         same &= np.array_equal(found.keys, seen.keys)
         judged.append(frames.marks(frame, seen.keys))
         picture = out / f"frame{frame}.png"

@@ -213,9 +213,11 @@ def _judge(
     robot_frames, kept, padding_m = 0, 0, []
     for frame, estimate in zip(watched, estimates, strict=True):
         if estimate is None:
-            voxels = pipeline.process(frame.depth, None)
+            voxels = pipeline.process(frame.depth, None).voxels
         else:
-            voxels = pipeline.process(frame.depth, estimate.positions, joint_uncertainty_rad=estimate.uncertainty)
+            voxels = pipeline.process(
+                frame.depth, estimate.positions, joint_uncertainty_rad=estimate.uncertainty
+            ).voxels
             grown_m = robot.displacement_m(estimate.uncertainty, estimate.positions).max()
             padding_m.append(pipeline.settings.robot_padding_m + float(grown_m))
         robot_frames += bool(_others(voxels, frame.box))

@@ -31,13 +31,18 @@ from shared.service import ServiceManager
 
 if TYPE_CHECKING:
     from edge_unit.daemon.unit import Unit
+    from edge_unit.source_factory import SourceFactories
 
 logger = logging.getLogger("edge_unit")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; what can be expected to go wrong is one line and exit code 1."""
+def main(arguments: Sequence[str] | None = None, factories: SourceFactories | None = None) -> int:
+    """Run the command; what can be expected to go wrong is one line and exit code 1.
+
+    `factories` make sources in the place of the product's own, for the types of configuration that they name.
+    """
     options = _parser().parse_args(arguments)
+    options.factories = factories or {}
     logging.basicConfig(level=options.log_level, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     # One line for each request would fill the journal.
     logging.getLogger("httpx").setLevel(logging.WARNING)
@@ -57,9 +62,10 @@ def _run(options: argparse.Namespace) -> int:
         settle(config.jit_cache_dir)
     # Imported only now, for kernels settle where they are kept when they are imported.
     from edge_unit.daemon.unit import Unit
-    from edge_unit.source_factory import make_source
+    from edge_unit.source_factory import FACTORIES, make_source
 
-    asyncio.run(_until_told_to_stop(Unit(config, make_source(config.source))))
+    source = make_source(config.source, {**FACTORIES, **options.factories})
+    asyncio.run(_until_told_to_stop(Unit(config, source)))
     return 0
 
 

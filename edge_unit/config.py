@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import ssl
 from ipaddress import IPv4Address, IPv6Address
 from pathlib import Path
@@ -18,6 +17,7 @@ from edge_unit.sources.recorded import RecordedSourceConfig, read_pose
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from edge_unit.tls import normalised, tls_context
 from shared.errors import ConfigError
+from shared.files import default_state_dir
 from shared.messages import MAX_TEXT
 from shared.transforms import Transform, from_xyz_rpy, validated
 
@@ -67,14 +67,6 @@ SourceConfig = Annotated[
 ]
 
 
-def default_state_dir() -> Path:
-    """Where a service manager, or else the user's own conventions, want state to be kept."""
-    if managed := os.environ.get("STATE_DIRECTORY"):
-        return Path(managed.split(":")[0])
-    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    return Path(home) / "cellwatch" / "edge-unit"
-
-
 class UnitConfig(Configured):
     """From a YAML file, `CELLWATCH_UNIT_*` variables and flags. Only `source` has no default."""
 
@@ -95,7 +87,9 @@ class UnitConfig(Configured):
     )
     token: SecretStr | None = Field(default=None, description="The units' token itself ...")
     token_file: Path | None = Field(default=None, description="... or the file that holds it.")
-    state_dir: Path = Field(default_factory=default_state_dir, description="For the cell and the learned background.")
+    state_dir: Path = Field(
+        default_factory=lambda: default_state_dir("edge-unit"), description="For the cell and the learned background."
+    )
     jit_cache_dir: Path | None = Field(default=None, description="For compiled kernels.")
     source_address: str | None = Field(default=None, description="Own IP address to connect from.")
     T_world_camera: PoseConfig | None = Field(

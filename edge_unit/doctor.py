@@ -391,8 +391,6 @@ def _pipeline(
         joints = np.full(count, 0.02 * number) if count else None
         started_ns = monotonic_ns()
         pipeline.process(depth, joints)
-        pipeline.health()
-        pipeline.seen()
         costs_ms.append((monotonic_ns() - started_ns) / NS_PER_MS)
         if number == 0:
             compiled_s = (monotonic_ns() - began_ns) / NS_PER_S

@@ -19,7 +19,7 @@ import signal
 import socket
 import ssl
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -94,7 +94,7 @@ class _Server(uvicorn.Server):
         listener: socket.socket,
         limits: Limits,
         tls: ssl.SSLContext | None,
-        ready: dict[str, Any],
+        ready: Mapping[str, str | int],
         ready_file: Path | None,
         host: str,
         status: Callable[[], str],
@@ -246,7 +246,7 @@ def _serve(
         ready,
         config.ready_file,
         config.host,
-        lambda: _status(app.state.master, ready["url"]),
+        lambda: _status(app.services.master, ready["url"]),
         Announcer(lambda: says(sha256), listens_at, port) if says is not None else None,
         gate,
     )
@@ -263,7 +263,7 @@ def _serve(
 
 def _status(master: Readable, url: str) -> str:
     """One line for a person: how many units are live, and where the master listens."""
-    states = [unit["state"] for unit in master.unit_states(monotonic_ns())]
+    states = [unit.state for unit in master.unit_states(monotonic_ns())]
     return f"{states.count('live')} of {len(states)} units live; at {url}"
 
 

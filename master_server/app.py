@@ -22,8 +22,9 @@ from master_server.api.routes import cell, health, images, map, recording, repla
 from master_server.api.routes.common import ip_of, log_refusal, refused
 from master_server.api.routes.replay import RefusedUpdate
 from master_server.api.routes.update import UpdateEndpoint
+from master_server.api.services import MasterServices, Services
 from master_server.cells.cell_loading import CellLoader
-from master_server.core import Master, Readable, ReadableCell
+from master_server.core import Master, ReadableCell, Ticker
 from master_server.recording.recorder import Recorder
 from master_server.recording.replay import Replay
 from master_server.security import Access, Limits
@@ -45,7 +46,9 @@ REPLAY_HEADER = (b"cellwatch-replay", b"true")
 class Application(FastAPI):
     """FastAPI, but for the one path that takes an update: it is spared the way through it."""
 
+    services: Services
     update: ASGIApp
+    gate: Gate | None = None
     _described_for: ReadableCell | None = None
 
     def take_updates(self, update: ASGIApp) -> None:
@@ -55,7 +58,7 @@ class Application(FastAPI):
 
     def openapi(self) -> dict[str, Any]:
         """The API described, with examples for the cell as it is now."""
-        master: Readable = self.state.master
+        master = self.services.master
         if self.openapi_schema is None:
             self.openapi_schema = describe(self, isinstance(self, ReplayApplication))
         if self._described_for is not master.published:
@@ -70,7 +73,7 @@ class Application(FastAPI):
         scope["app"] = self
         # Before anything else, so that whom it refuses costs next to nothing.
         try:
-            self.state.limits.admit(ip_of(scope), monotonic_ns())
+            self.services.limits.admit(ip_of(scope), monotonic_ns())
         except Refusal as refusal:
             log_refusal(scope, refusal)
             if scope["type"] == "http":
@@ -101,51 +104,61 @@ def make_app(
 ) -> Application:
     """The application that serves one master; `limits` are shared with what holds its connections."""
     routers = [module.router for module in (units, images, cell, map, stream, robot, recording, health)]
-    app = _assembled(Application, master, access, routers, recorder, limits, master.store.follow)
-    app.state.loader = CellLoader()
-    app.state.pictures = Pictures(master.registry)
-    app.state.metrics = metrics = Metrics(master, app.state.stream, app.state.limits)
-    app.state.started_at_ns = monotonic_ns()
-    app.take_updates(UpdateEndpoint(master, metrics))
+    limits = limits or Limits()
+    listeners = Stream(master)
+    services = MasterServices(
+        master=master,
+        access=access,
+        limits=limits,
+        stream=listeners,
+        history=History(master),
+        recorder=recorder,
+        loader=CellLoader(),
+        pictures=Pictures(master.registry),
+        metrics=Metrics(master, listeners, limits),
+        started_at_ns=monotonic_ns(),
+    )
+    app = _assembled(Application, services, routers, Ticker(master), master.store.follow)
+    app.take_updates(UpdateEndpoint(master, services.metrics))
     return app
 
 
 def make_replay_app(played: Replay, access: Access, limits: Limits | None = None) -> Application:
     """The application that serves a recording as if it were the master."""
     routers = [module.router for module in (units, cell, map, stream, robot, recording, replay)]
-    app = _assembled(ReplayApplication, played, access, routers, None, limits)
+    services = Services(
+        master=played, access=access, limits=limits or Limits(), stream=Stream(played), history=History(played)
+    )
+    app = _assembled(ReplayApplication, services, routers)
     app.take_updates(RefusedUpdate())
     return app
 
 
 def add_viewer(app: Application, actions: dict[str, str]) -> Gate:
     """Let operators see it under `/viewer/`; costs nothing while nobody looks."""
-    state = app.state
-    state.viewer = gate = Gate(
-        ViewerHost(app, state.master, state.history, state.access, actions), Sessions(state.access)
-    )
+    services = app.services
+    host = ViewerHost(app, services.master, services.history, services.access, actions)
+    app.gate = Gate(host, Sessions(services.access))
     app.include_router(proxy.router)
-    return gate
+    return app.gate
 
 
 def _assembled(
     kind: type[Application],
-    master: Readable,
-    access: Access,
+    services: Services,
     routers: list[APIRouter],
-    recorder: Recorder | None,
-    limits: Limits | None,
+    ticker: Ticker | None = None,
     *beside: Callable[[], Coroutine[None, None, None]],
 ) -> Application:
-    listeners = Stream(master)
-    history = History(master)
-
     @asynccontextmanager
-    async def running(app: FastAPI) -> AsyncIterator[None]:
+    async def running(_: FastAPI) -> AsyncIterator[None]:
         # Now, while nobody waits for it.
         app.openapi()
-        listeners.start()
-        tasks = [asyncio.create_task(work()) for work in (access.follow, history.follow, *beside)]
+        if ticker is not None:
+            ticker.start()
+        works = (services.access.follow, services.history.follow, *beside)
+        tasks = [asyncio.create_task(work()) for work in works]
+        recorder = services.recorder
         if recorder is not None and recorder.enabled:
             await recorder.begin()
         try:
@@ -153,9 +166,11 @@ def _assembled(
         finally:
             for task in tasks:
                 task.cancel()
-            listeners.stop()
-            if app.state.viewer is not None:
-                await app.state.viewer.host.close()
+            if ticker is not None:
+                ticker.stop()
+            services.stream.stop()
+            if app.gate is not None:
+                await app.gate.host.close()
             if recorder is not None:
                 await recorder.stop()
 
@@ -173,13 +188,7 @@ def _assembled(
         },
         lifespan=running,
     )
-    app.state.master = master
-    app.state.access = access
-    app.state.limits = limits or Limits()
-    app.state.stream = listeners
-    app.state.history = history
-    app.state.recorder = recorder
-    app.state.viewer = None
+    app.services = services
     for router in routers:
         app.include_router(router)
     serve_documentation(app)

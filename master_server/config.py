@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -11,19 +10,12 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from master_server.logs import LogFormat, LogLevel
 from master_server.recording.recorder import RecordingConfig
 from master_server.recording.replay import SPEED_MAX, SPEED_MIN
+from shared.files import default_state_dir
 from shared.settings import Settings
 
 ENVIRONMENT_PREFIX = "CELLWATCH_MASTER_"
 
 DEFAULT_PORT = 8420
-
-
-def default_state_dir() -> Path:
-    """Where a service manager, or else the user's own conventions, want state to be kept."""
-    if managed := os.environ.get("STATE_DIRECTORY"):
-        return Path(managed.split(":")[0])
-    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    return Path(home) / "cellwatch" / "master"
 
 
 class ServerConfig(BaseModel):
@@ -36,7 +28,8 @@ class ServerConfig(BaseModel):
     tls_certificate: Path | None = Field(default=None, description="PEM; with it and its key the master speaks TLS.")
     tls_key: Path | None = Field(default=None, description="Of the certificate, in PEM, without a password.")
     state_dir: Path = Field(
-        default_factory=default_state_dir, description="Where tokens and all that outlives the master are kept."
+        default_factory=lambda: default_state_dir("master"),
+        description="Where tokens and all that outlives the master are kept.",
     )
     public_reads: bool = Field(default=False, description="Whether reading needs no token.")
     log_level: LogLevel = Field(default="INFO", description="The least that is logged.")

@@ -11,8 +11,9 @@ Each prints its tables and marks, and leaves them as JSON in `out/results/`. In 
     soak           for as long as is wished: no answer wrong, nothing grows
     socket_site/   where `make plug-and-play` plugs its units in
     plug_and_play  units are plugged in, moved, exchanged, knocked and covered
-    machines/      machines that boot, for `make rehearsal` and `make image-test`
+    machines/      machines that boot, and fresh ones
     boot           three units and a master as such machines: switched on, failing, coming back
     image          two of them boot from one image and report to a master
+    fresh_machine  both commands of the README where there are only Python, its venv and make
     window         the operator's window in a real browser, and what those who look cost the units
 """

@@ -20,7 +20,7 @@ from shared.configuration import sentence
 from shared.errors import CellError, InputError, KinematicsError, MeshError
 from shared.joint_table import DHJoint
 from shared.kinematics import Robot
-from shared.lattice import Lattice
+from shared.lattice import Lattice, block_lattice
 from shared.meshes import MAX_COORDINATE_M, TriangleMesh, box_mesh, cylinder_mesh, load_mesh, mesh_by_hash
 from shared.transforms import Transform, validated
 
@@ -165,6 +165,10 @@ class Cell:
             InputError: the box would need too many voxels of this size.
         """
         return Lattice.covering(self.box_min_m, self.box_max_m, voxel_size_m)
+
+    def blocks(self, block_size_m: float) -> Lattice:
+        """The blocks by which units report what they look through; larger ones where there would be `MAX_BLOCKS`."""
+        return block_lattice(self.box_min_m, self.box_max_m, block_size_m)
 
     def with_object_pose(self, name: str, T_world_mesh: ArrayLike) -> Cell:
         """The same cell with one of its objects elsewhere.

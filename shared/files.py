@@ -21,6 +21,14 @@ UNREADABLE = (OSError, ValueError, KeyError, TypeError, OverflowError, Recursion
 """What reading and parsing a damaged document raises."""
 
 
+def default_state_dir(program: str) -> Path:
+    """The folder where a service manager, or else the user's own conventions, want a program's state to be kept."""
+    if managed := os.environ.get("STATE_DIRECTORY"):
+        return Path(managed.split(":")[0])
+    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(home) / "cellwatch" / program
+
+
 def write_whole(path: Path, content: bytes, *, synced: bool = True) -> None:
     """Write a file whole or not at all.
 

@@ -31,6 +31,9 @@ NUMBERS, INTEGERS = "iuf", "iu"
 SHOWN_CHARS = 60
 """Enough of a wrong value to recognise it."""
 
+MAX_BLOCKS = 2**17
+"""Of a cell's box: 16 kB of a seen report's bits before compression, and 128 KiB of the master's memory a unit."""
+
 EDGE_TOLERANCE = 1e-6
 """A box of 3.0 m at 0.1 m has 30 voxels, although 3.0 / 0.1 is 30.000000000000004 in floating point."""
 
@@ -149,6 +152,19 @@ class Lattice:
             raise InputError(f"keys: expected 0 <= key < {self.cell_count}, got {found.min()} to {found.max()}")
         _, ny, nz = self.shape
         return np.stack((found // (ny * nz), found // nz % ny, found % nz), axis=-1).astype(np.int16)
+
+
+def block_lattice(box_min_m: NDArray[np.float64], box_max_m: NDArray[np.float64], block_size_m: float) -> Lattice:
+    """The box from `box_min_m` (3,) to `box_max_m` (3,) in blocks, by which units report what they look through.
+
+    In a box that needs more than `MAX_BLOCKS`, they are twice as large as `block_size_m`, and so on.
+
+    Raises:
+        InputError: as in `Lattice.covering`.
+    """
+    while np.ceil((box_max_m - box_min_m) / block_size_m).prod() > MAX_BLOCKS:
+        block_size_m *= 2.0
+    return Lattice.covering(box_min_m, box_max_m, block_size_m)
 
 
 def _numbers(value: ArrayLike, name: str, expected: str, kinds: str = NUMBERS) -> NDArray[Any]:

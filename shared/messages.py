@@ -25,7 +25,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    field_validator,
+    model_validator,
+)
 
 from shared.camera import Intrinsics
 from shared.errors import InputError
@@ -337,9 +346,18 @@ class Reason:
     Numbers are in the units that end their names; `unit` is the id of the unit that it is about.
     """
 
+    # Readers pass over what a later master tells besides, also within a message that forbids it.
+    __pydantic_config__ = ConfigDict(extra="ignore")
+
     code: ReasonCode
     sentence: str
     numbers: dict[str, float] = field(default_factory=dict)
+
+
+_REASON = TypeAdapter(Reason)
+
+ReadReason = Annotated[Reason, BeforeValidator(_REASON.validate_python)]
+"""A reason that is read strictly, too, where only an instance would count as one."""
 
 
 class Progress(Message):
@@ -475,7 +493,7 @@ class UnitRow(Answer):
     software: str
     state: State
     reason: str
-    cause: Reason | None = Field(default=None, description="The reason for programs; absent where there is none.")
+    cause: ReadReason | None = Field(default=None, description="The reason for programs; absent where there is none.")
     phase: Phase = Field(default="live", description="How far it has come: registering, fetching, localising, live.")
     age_s: float | None = Field(description="Since the capture of its last frame.")
     arrival_age_s: float | None = Field(description="Since its last update arrived.")

@@ -7,17 +7,22 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shared.errors import InputError
 
-Transform = NDArray[np.float64]
+Transform: TypeAlias = NDArray[np.float64]
 
 ROTATION_TOLERANCE = 1e-4
 """How far `R @ R.T` may be from the identity: poses are read from text files with few digits."""
+
+LAST_ROW_TOLERANCE = 1e-6
+"""How far the last row may be from 0 0 0 1: a product or an inverse of transforms in float32 leaves it off by 1e-7."""
+
+_LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 
 
 def identity() -> Transform:
@@ -26,10 +31,11 @@ def identity() -> Transform:
 
 
 def validated(value: ArrayLike, name: str) -> Transform:
-    """Return `value` as a (4, 4) float64 rigid transform.
+    """Return `value` as a (4, 4) float64 rigid transform, a copy whose last row is exactly 0 0 0 1.
 
     Raises:
-        InputError: it is not (4, 4), not finite, or its rotation is not orthonormal and right-handed.
+        InputError: it is not (4, 4), not finite, or its rotation is not orthonormal and right-handed, or its last row
+            is off by more than rounding.
     """
     try:
         matrix = np.array(value, dtype=np.float64)
@@ -39,8 +45,9 @@ def validated(value: ArrayLike, name: str) -> Transform:
         raise InputError(f"{name}: expected a 4x4 matrix, got shape {matrix.shape}")
     if not np.isfinite(matrix).all():
         raise InputError(f"{name}: expected finite numbers, got NaN or infinity")
-    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=1e-9):
+    if np.abs(matrix[3] - _LAST_ROW).max() > LAST_ROW_TOLERANCE:
         raise InputError(f"{name}: expected the last row 0 0 0 1, got {matrix[3].tolist()}")
+    matrix[3] = _LAST_ROW
     rotation = matrix[:3, :3]
     deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if deviation > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Waiting with a limit, without losing a cancellation.
+"""Waiting with a limit, without losing a cancellation; and being called at a time, by a clock that tests may set.
 
 `asyncio.wait_for` of Python 3.11 and older swallows a cancellation that arrives together with what is waited for; a
 task that is woken thirty times a second then goes on for ever although it was told to end.
@@ -8,9 +8,40 @@ task that is woken thirty times a second then goes on for ever although it was t
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine, Generator
+from collections.abc import Callable, Coroutine, Generator
 from types import coroutine
-from typing import Any
+from typing import Any, Protocol
+
+from shared.clock import NS_PER_S, monotonic_ns
+
+
+class Timer(Protocol):
+    """A call that is still to come."""
+
+    def cancel(self) -> None:
+        """It does not come."""
+
+
+class Clock(Protocol):
+    """A monotonic clock in nanoseconds that also calls back."""
+
+    def now_ns(self) -> int:
+        """The time."""
+
+    def call_at(self, at_ns: int, do: Callable[[], object]) -> Timer:
+        """Have `do` called at this time, or soon when it is past."""
+
+
+class LoopClock:
+    """The machine's monotonic clock, with the timers of the event loop that runs."""
+
+    def now_ns(self) -> int:
+        """The time."""
+        return monotonic_ns()
+
+    def call_at(self, at_ns: int, do: Callable[[], object]) -> Timer:
+        """Have `do` called at this time, or soon when it is past."""
+        return asyncio.get_running_loop().call_later(max(at_ns - monotonic_ns(), 0) / NS_PER_S, do)
 
 
 async def within(timeout_s: float, work: Coroutine[Any, Any, object]) -> bool:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from typing import NoReturn
 
 import pytest
@@ -18,7 +19,14 @@ def missing(reason: str) -> NoReturn:
     pytest.skip(reason)
 
 
+def need_command(command: str, package: str) -> None:
+    """A command that no wheel brings, and the package of the distribution that does."""
+    if shutil.which(command) is None:
+        missing(f"there is no {command} here (apt-get install {package})")
+
+
 def need_namespaces() -> None:
     """Networks of its own, in which a test may do what it likes."""
+    need_command("ip", "iproute2")
     if not any(allowed(unshare) for unshare in NAMESPACES):
         missing("the kernel allows no namespaces here")

@@ -62,7 +62,7 @@ def watch(ours: str, others: Fixed, settings: FilterSettings, held_out: int) -> 
 
     def judge(frame: int) -> list[Judged]:
         depth, joints = frames.depth[frame], frames.joints[frame]
-        found = [Judged(ours, frame, frames.marks(frame, pipeline.process(depth, joints)))]
+        found = [Judged(ours, frame, frames.marks(frame, pipeline.process(depth, joints).voxels))]
         measured = Measured(depth, joints, pipeline.expected_depth(None), robot_of(depth, joints))
         for name, rule in others.items():
             survives = before(place, measured, rule.limit_m)

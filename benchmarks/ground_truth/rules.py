@@ -84,7 +84,7 @@ class Ours:
         """See `Rule`."""
         settings = self.settings.model_copy(update={"voxel_size_m": voxel_size_m})
         pipeline = DepthPipeline(place.intrinsics, place.T_world_camera, place.cell, settings)
-        return lambda frame: pipeline.process(frame.depth, frame.joints).keys
+        return lambda frame: pipeline.process(frame.depth, frame.joints).voxels.keys
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-import edge_unit.source_factory
 from benchmarks.latency_probe.frames import RING_HZ, camera_phase_s
 from edge_unit.__main__ import main
-from edge_unit.config import SourceConfig
 from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from shared.clock import NS_PER_S, monotonic_ns
@@ -65,13 +63,12 @@ class RingSource:
         self._frames = None
 
 
-def make_source(config: SourceConfig) -> DepthSource:
-    """The source of a configuration whose kind is `simulated`."""
-    assert isinstance(config, SimulatedSourceConfig)
+def ring_source(config: SimulatedSourceConfig) -> DepthSource:
+    """Make the camera that plays what lies at its `handling`."""
     assert config.handling is not None
     return RingSource(config, config.handling)
 
 
 if __name__ == "__main__":
-    edge_unit.source_factory.make_source = make_source
-    sys.exit(main(["run", *sys.argv[1:], "--log-level", "WARNING"]))
+    arguments = ["run", *sys.argv[1:], "--log-level", "WARNING"]
+    sys.exit(main(arguments, {SimulatedSourceConfig: ring_source}))

@@ -17,7 +17,7 @@ ONE_OCTREE = "centralised, as MoveIt's updaters"
 UNITS_SAME_FRAMES = "distributed, composed, all cameras with the same frames"
 
 CONTENDERS = {
-    UNITS_COMPOSED: "Each unit's work (process(), seen(), health()) on a core of its own, then its update by the "
+    UNITS_COMPOSED: "Each unit's work (process()) on a core of its own, then its update by the "
     "units' own client over HTTP on loopback to a real master; the slowest counts. To it are added what the updates "
     "of all units at the same moment take longer than one, and the master's merge.",
     UNITS_RUNNING: "One process for each unit and one for the master, which share the cores of this machine: from "

@@ -44,16 +44,16 @@ class UnitWork:
 
     def look(self, depth: NDArray[np.uint16], joints: NDArray[np.float64]) -> Sight:
         """Filter a frame, and tell what was seen and how well it fits; the seen report is made anew each time."""
-        voxels = self.pipeline.process(depth, joints)
-        seen, health = self.pipeline.seen(), self.pipeline.health()
+        result = self.pipeline.process(depth, joints)
+        voxels, health = result.voxels, result.health
         told = Health(
             valid_share=health.valid_share,
             agreeing_share=health.agreeing_share,
             residual_share=health.residual_share,
             static_share=health.static_share,
-            process_ms=round(self.pipeline.last.total_ns / NS_PER_MS, 3),
+            process_ms=round(result.times.total_ns / NS_PER_MS, 3),
         )
-        return Sight(voxels.keys, keys_to_bytes(voxels.keys), seen_report(seen), told)
+        return Sight(voxels.keys, keys_to_bytes(voxels.keys), seen_report(result.seen), told)
 
 
 class Centralised:
@@ -76,10 +76,8 @@ class Centralised:
         for camera, work in enumerate(self._work):
             began_ns = stage_ns()
             pipeline = work.pipeline
-            voxels = pipeline.process(views.depth[camera, n], views.joints[n])
             # A central computer must know no less of what is seen, and how well it fits.
-            pipeline.seen()
-            pipeline.health()
+            voxels = pipeline.process(views.depth[camera, n], views.joints[n]).voxels
             self._map.replace(camera, voxels.keys)
             filtered_ns = stage_ns()
             self.merged, _ = self._map.voxels()

@@ -79,7 +79,7 @@ def watch(part: Part, intrinsics: Intrinsics, settings: FilterSettings) -> Quiet
     examples: list[str] = []
     for number in range(part.first, part.last):
         frame = camera.capture(number * FRAME_S)
-        voxels = pipeline.process(frame.depth, frame.joints)
+        voxels = pipeline.process(frame.depth, frame.joints).voxels
         false_frames += len(voxels) > 0
         false_voxels += len(voxels)
         for centre, count in zip(voxels.lattice.centres(voxels.indices), voxels.counts, strict=True):

@@ -138,7 +138,7 @@ def speckle(voxel_m: float, frames: int, settings: FilterSettings) -> Tally:
         z_m = SPECKLE_DISTANCE_M + sigma_m * (rng.standard_normal() + math.sqrt(0.1) * rng.standard_normal(pixels))
         depth[rows, columns] = np.round(z_m / stage.intrinsics.depth_scale_m).astype(np.uint16)
         for rule, pipeline in pipelines.items():
-            reported[rule] += len(pipeline.process(depth, None)) > 0
+            reported[rule] += len(pipeline.process(depth, None).voxels) > 0
     return Tally(f"speckle to {SPECKLE_PX} px (reported)", "D435i", SPECKLE_DISTANCE_M, voxel_m, frames, reported)
 
 
@@ -189,4 +189,4 @@ def _tally(stage: Stage, body: Body, pipelines: dict[str, DepthPipeline], lost: 
     """One frame with `body` before every rule."""
     depth = stage.frame(body).depth
     for rule, pipeline in pipelines.items():
-        lost[rule] += not reported_at(pipeline.process(depth, None), body)
+        lost[rule] += not reported_at(pipeline.process(depth, None).voxels, body)

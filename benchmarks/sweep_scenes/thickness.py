@@ -95,7 +95,7 @@ class Trial:
 
     def _voxels(self, i: int, *boxes: Body) -> Voxels:
         """What is reported of the next frame, on the lattice whose turn it is."""
-        return self._pipelines[i % SHIFTS].process(self._stage.frame(*boxes).depth, None)
+        return self._pipelines[i % SHIFTS].process(self._stage.frame(*boxes).depth, None).voxels
 
 
 @dataclass(frozen=True)

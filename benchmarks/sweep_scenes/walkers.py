@@ -72,7 +72,7 @@ class _Watcher:
     def look(self, t_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Keys of the voxels that are reported, visible, visible and outside the margin, and of surfaces."""
         frame = self.camera.capture(t_s)
-        reported = self.pipeline.process(frame.depth, frame.joints).keys
+        reported = self.pipeline.process(frame.depth, frame.joints).voxels.keys
         true_raw = np.where(np.isfinite(frame.true_z_m), np.rint(frame.true_z_m / self._scale_m), 0.0)
         passes = self._true_pipeline.foreground(np.minimum(true_raw, 65535.0).astype(np.uint16), frame.joints)
         truth = self._finder.find(frame.view, np.where(passes, np.inf, 0.0).astype(np.float32))

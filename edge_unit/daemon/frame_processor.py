@@ -10,7 +10,7 @@ from edge_unit.daemon.background_learning import Learning
 from edge_unit.daemon.joint_lookup import FrameJoints, known
 from edge_unit.daemon.pipeline_manager import AssignedPipeline
 from edge_unit.daemon.refinement_task import Refining
-from edge_unit.daemon.report import health_of, troubled, within_bounds
+from edge_unit.daemon.report import health_of, parts_of, troubled, within_bounds
 from edge_unit.joints import JointEstimate
 from edge_unit.monitoring import Stages, Stance
 from edge_unit.pipeline import DepthPipeline
@@ -98,13 +98,13 @@ class FrameWork:
         """What a frame shows, and whether its camera can be trusted."""
         stages.end("thread")
         positions, uncertainty = known(joints)
-        voxels = pipeline.process(frame.depth, positions, joint_uncertainty_rad=uncertainty)
-        took = pipeline.last
-        stages.end("check", {"robot": took.expected_ns, "filter": took.points_ns, "density": took.voxels_ns})
-        voxels, seen, crowd = within_bounds(pipeline, voxels)
-        stance = self._stance.watch(pipeline, frame.captured_at_ns)
+        is_due = self._stance.due(frame.captured_at_ns)
+        result = pipeline.process(frame.depth, positions, joint_uncertainty_rad=uncertainty, with_misfit=is_due)
+        stages.end("check", parts_of(result.times))
+        voxels, seen, crowd = within_bounds(result, pipeline.T_world_camera)
+        stance = self._stance.watch(result.misfit, pipeline.static_version, frame.captured_at_ns)
         warning = stance.warning or self._joints.warning(assignment.settings.joint_delay_s) or crowd
-        health = health_of(pipeline, frame, stance, warning)
+        health = health_of(result, frame, stance, warning)
         self._refining.gather(pipeline, frame.depth, joints)
         keys = keys_to_bytes(voxels.keys)
         stages.end("report")

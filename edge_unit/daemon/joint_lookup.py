@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-import asyncio
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edge_unit.joints import DelayWatch, JointEstimate
 from edge_unit.pipeline import DepthPipeline
-from edge_unit.pipeline.depth_pipeline import EXACT
+from edge_unit.pipeline.moving_model import EXACT
 from edge_unit.sources.frame import DepthFrame
 from edge_unit.uplink.uplink import Assignment, Uplink
 from shared.clock import NS_PER_S
@@ -38,17 +38,20 @@ class FrameJoints:
         uncertainty_ns = clock.uncertainty_ns(frame.captured_at_ns)
         return self._uplink.joints.at(at_ns, uncertainty_ns, assignment.settings.robot_stale_after_s)
 
-    async def watch_delay(self, pipeline: DepthPipeline, frame: DepthFrame) -> None:
-        """Look whether the joints are later than the settings say; the frame was offered and need not wait."""
+    def watch_delay(self, pipeline: DepthPipeline, frame: DepthFrame) -> Callable[[], None] | None:
+        """Return what looks whether the joints are later than the settings say, for a thread beside the frames.
+
+        Mostly there is nothing to look at: None. The frame is copied where it is wanted later. Not while another thread
+        works with the pipeline.
+        """
         clock = self._uplink.clock
         if frame.joints is not None or not clock.known:
-            return
+            return None
         at_ns = frame.captured_at_ns + clock.offset_ns
-        joints = self._delay.joints(self._uplink.joints)
-        if joints is not None:
-            await asyncio.to_thread(self._delay.look, joints)
+        look = self._delay.next_look(self._uplink.joints)
         if self._delay.due(at_ns):
-            await asyncio.to_thread(self._delay.keep, pipeline, frame.depth, at_ns)
+            self._delay.keep(pipeline, frame.depth, at_ns)
+        return look
 
     def warning(self, joint_delay_s: float) -> str | None:
         """What to set instead, where `joint_delay_s` is clearly off."""

@@ -4,32 +4,44 @@
 from __future__ import annotations
 
 from edge_unit.monitoring import Verdict
-from edge_unit.pipeline import DepthPipeline, SeenBlocks, Voxels
+from edge_unit.pipeline import FrameResult, SeenBlocks, StageTimes, Voxels
 from edge_unit.sources.frame import DepthFrame
 from edge_unit.uplink.uplink import Assignment, Report, Trouble
 from shared.clock import NS_PER_MS
 from shared.messages import MAX_VOXELS, Health
+from shared.transforms import Transform
 
 
-def within_bounds(pipeline: DepthPipeline, voxels: Voxels) -> tuple[Voxels, SeenBlocks, str | None]:
-    """Voxels and seen blocks of the frame that was processed last, and a warning where not all can be reported."""
-    seen = pipeline.seen()
+def within_bounds(result: FrameResult, T_world_camera: Transform) -> tuple[Voxels, SeenBlocks, str | None]:
+    """Return a frame's voxels and seen blocks, and a warning where not all can be reported."""
+    voxels, seen = result.voxels, result.seen
     if len(voxels) <= MAX_VOXELS:
         return voxels, seen, None
     crowd = f"{len(voxels)} obstacle voxels: the {MAX_VOXELS} nearest are reported, the rest counts as not seen"
-    nearest, beyond = voxels.nearest(pipeline.T_world_camera[:3, 3], MAX_VOXELS)
+    nearest, beyond = voxels.nearest(T_world_camera[:3, 3], MAX_VOXELS)
     return nearest, seen.without(beyond), crowd
 
 
-def health_of(pipeline: DepthPipeline, frame: DepthFrame, stance: Verdict, warning: str | None) -> Health:
-    """Whether the camera can be trusted, by the frame that the pipeline processed last."""
-    fit = pipeline.health()
+def parts_of(times: StageTimes) -> dict[str, int]:
+    """Return the method's stages as the parts of a unit's frame, ns."""
+    return {
+        "robot": times.expected_ns,
+        "filter": times.foreground_ns,
+        "density": times.density_ns,
+        "seen": times.seen_ns,
+        "health": times.health_ns + times.misfit_ns,
+    }
+
+
+def health_of(result: FrameResult, frame: DepthFrame, stance: Verdict, warning: str | None) -> Health:
+    """Tell whether the camera can be trusted, by what a frame told."""
+    fit = result.health
     return Health(
         valid_share=fit.valid_share,
         agreeing_share=fit.agreeing_share,
         residual_share=fit.residual_share,
         static_share=fit.static_share,
-        process_ms=round(pipeline.last.total_ns / NS_PER_MS, 3),
+        process_ms=round(result.times.total_ns / NS_PER_MS, 3),
         frame=frame.frame_number,
         moved=stance.moved or None,
         blind=stance.blind or None,

@@ -263,7 +263,9 @@ class Unit:
         await self._showing.show(orders.pictures, frame, joints)
         pipeline = self._assigned.pipeline
         if pipeline is not None and joints is not None and report.health.trouble is None:
-            await self._joints.watch_delay(pipeline, frame)
+            look = self._joints.watch_delay(pipeline, frame)
+            if look is not None:
+                self._errands.start(asyncio.to_thread(look))
         if self._stance.unsaved:
             self._errands.start(asyncio.to_thread(self._stance.save))
         gathered = self._refining.take()

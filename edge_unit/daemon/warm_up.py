@@ -32,23 +32,14 @@ def rehearse() -> None:
     cell = Cell("rehearsal", np.full(3, -1.0), np.full(3, 2.0), static=(wall,), robot=robot)
     pipeline = DepthPipeline(CAMERA, identity(), cell)
     for joint_rad in (0.0, 0.1):
-        pipeline.process(np.full(CAMERA.shape, DEPTH_MM, np.uint16), np.array([joint_rad]))
-    _look(pipeline)
+        pipeline.process(np.full(CAMERA.shape, DEPTH_MM, np.uint16), np.array([joint_rad]), with_misfit=True)
 
 
 def warm_up(pipeline: DepthPipeline) -> None:
     """Have all that `pipeline` needs ready, by a frame that shows nothing."""
     robot = pipeline.cell.robot
     joints = None if robot is None else np.zeros(robot.joint_count)
-    pipeline.process(np.zeros(pipeline.intrinsics.shape, np.uint16), joints)
-    _look(pipeline)
+    pipeline.process(np.zeros(pipeline.intrinsics.shape, np.uint16), joints, with_misfit=True)
     # What is there now stays; without this, each full collection looks through it, and a frame waits 0.1 s.
     gc.collect()
     gc.freeze()
-
-
-def _look(pipeline: DepthPipeline) -> None:
-    """All that is asked of a frame."""
-    pipeline.health()
-    pipeline.seen()
-    pipeline.misfit()

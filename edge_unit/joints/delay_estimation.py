@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -73,7 +74,7 @@ class DelayLook:
         self._first_px = stride_px // 2
         self._static_depth_m = self._thinned(static_depth_m)
         height, width = self._static_depth_m.shape
-        small = Intrinsics(
+        self._small = Intrinsics(
             width,
             height,
             intrinsics.fx / stride_px,
@@ -82,9 +83,13 @@ class DelayLook:
             (intrinsics.cy - self._first_px) / stride_px,
         )
         self._links = Links(robot, inverse(T_world_camera))
-        self._bare_robot = BareRobot(small, robot)
         self._scale_m = intrinsics.depth_scale_m
         self._noise_per_m = SCALE_NOISE_GAIN * intrinsics.disparity_noise_m(settings.stereo_subpixel_px)
+
+    @cached_property
+    def _bare_robot(self) -> BareRobot:
+        # With the first look, in its own thread: all of the links' CAD is prepared.
+        return BareRobot(self._small, self._robot)
 
     def thinned(self, depth: NDArray[np.uint16]) -> NDArray[np.float32]:
         """What `misfits` needs of a frame (H, W): a few thousand depths in metres, a copy."""

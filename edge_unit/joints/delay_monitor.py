@@ -2,12 +2,14 @@
 """While a unit runs: are the joints later than `joint_delay_s` says?
 
 Now and then a frame is kept, a few thousand of its depths, until joints from well after it are known; then it is
-looked at. Nothing is changed by itself: the operator is told what to set.
+looked at, in a thread beside the frames. Nothing is changed by itself: the operator is told what to set.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +21,7 @@ from shared.clock import NS_PER_S
 from shared.errors import InputError
 
 PERIOD_NS = NS_PER_S // 2
-"""Between two looks, each of which costs the time of a few frames."""
+"""Between two looks, each of which takes a core for the time of a few frames."""
 
 LOOKS_MAX = 96
 """The last three quarters of a minute in which the robot moved."""
@@ -33,66 +35,90 @@ _DELAYS_NS = np.rint(DELAYS_S * NS_PER_S).astype(np.int64)
 _HALF_SPAN_NS = round(0.5 * MOTION_SPAN_S * NS_PER_S)
 
 
+class _Looks:
+    """The looks at frames before one and the same background: what a thread works on, and nothing else."""
+
+    def __init__(self, look: DelayLook) -> None:
+        self.look = look
+        self.estimate: DelayEstimate | None = None
+        self._misfits: deque[NDArray[np.float64]] = deque(maxlen=LOOKS_MAX)
+
+    def add(self, thinned_m: NDArray[np.float32], joints: list[NDArray[np.float64]]) -> None:
+        """Look at a frame; joints (n,) at each of the delays."""
+        self._misfits.append(self.look.misfits(thinned_m, joints))
+        try:
+            self.estimate = estimate_delay(self._misfits)
+        except InputError:
+            # Too few as yet, or the camera does not see the robot: then there is nothing to tell.
+            self.estimate = None
+
+
 class DelayWatch:
-    """Gathers looks at one camera's frames. Times are by the master's clock."""
+    """Gathers looks at one camera's frames. Times are by the master's clock.
+
+    All is for one thread, except for what `next_look` returns: that may run in any other at the same time.
+    """
 
     def __init__(self) -> None:
         self._made_for: tuple[object, ...] = ()
-        self._look: DelayLook | None = None
+        self._looks: _Looks | None = None
         self._kept: tuple[int, NDArray[np.float32]] | None = None
         self._due_ns = 0
-        self._misfits: deque[NDArray[np.float64]] = deque(maxlen=LOOKS_MAX)
-        self._estimate: DelayEstimate | None = None
+        self._looking = False
 
     def due(self, at_ns: int) -> bool:
         """Whether the frame that was captured at `at_ns` should be kept; also after a clock that went back."""
         return not self._due_ns - 2 * PERIOD_NS <= at_ns < self._due_ns
 
     def keep(self, pipeline: DepthPipeline, depth: NDArray[np.uint16], at_ns: int) -> None:
-        """Keep a frame (H, W) that is due; all is begun anew when what is known besides the joints changed."""
+        """Keep a copy of a frame (H, W) that is due; all begins anew when what is known besides the joints changed."""
         robot = pipeline.cell.robot
         if robot is None:
             return
         made_for = pipeline, robot, pipeline.static_version
-        if self._look is None or made_for != self._made_for:
-            self._look = DelayLook(
-                pipeline.intrinsics, pipeline.T_world_camera, robot, pipeline.expected_depth(None), pipeline.settings
+        if self._looks is None or made_for != self._made_for:
+            self._looks = _Looks(
+                DelayLook(
+                    pipeline.intrinsics,
+                    pipeline.T_world_camera,
+                    robot,
+                    pipeline.expected_depth(None),
+                    pipeline.settings,
+                )
             )
-            self._made_for, self._estimate = made_for, None
-            self._misfits.clear()
-        self._kept = at_ns, self._look.thinned(depth)
+            self._made_for = made_for
+        self._kept = at_ns, self._looks.look.thinned(depth)
         self._due_ns = at_ns + PERIOD_NS
 
-    def joints(self, history: JointHistory) -> list[NDArray[np.float64]] | None:
-        """The joints with which the kept frame is to be looked at; None while they are not known, or when none is."""
-        if self._kept is None or self._look is None or history.newest_ns < self._kept[0] + int(_DELAYS_NS[-1]):
+    def next_look(self, history: JointHistory) -> Callable[[], None] | None:
+        """The look at the kept frame, to be called once; it touches neither the pipeline nor `history`.
+
+        None while joints from after the frame are not known, when none is kept or the robot did not move, and while
+        the look before it is not done.
+        """
+        kept, looks = self._kept, self._looks
+        if kept is None or looks is None or self._looking or history.newest_ns < kept[0] + int(_DELAYS_NS[-1]):
             return None
-        at_ns = self._kept[0]
+        self._kept = None
         found = [
-            history.at(at_ns + int(offset_ns), 0, EXTRAPOLATION_MAX_S)
+            history.at(kept[0] + int(offset_ns), 0, EXTRAPOLATION_MAX_S)
             for offset_ns in (-_HALF_SPAN_NS, _HALF_SPAN_NS, *_DELAYS_NS)
         ]
         positions = [each.positions for each in found if each is not None]
-        if len(positions) < len(found) or not self._look.moves(*positions[:2]):
-            self._kept = None
+        if len(positions) < len(found) or not looks.look.moves(*positions[:2]):
             return None
-        return positions[2:]
+        self._looking = True
+        return partial(self._look, looks, kept[1], positions[2:])
 
-    def look(self, joints: list[NDArray[np.float64]]) -> None:
-        """Look at the kept frame with what `joints` gave."""
-        assert self._kept is not None
-        assert self._look is not None
-        self._misfits.append(self._look.misfits(self._kept[1], joints))
-        self._kept = None
+    def _look(self, looks: _Looks, thinned_m: NDArray[np.float32], joints: list[NDArray[np.float64]]) -> None:
         try:
-            self._estimate = estimate_delay(self._misfits)
-        except InputError:
-            # Too few as yet, or the camera does not see the robot: then there is nothing to tell.
-            self._estimate = None
+            looks.add(thinned_m, joints)
+        finally:
+            self._looking = False
 
     def warning(self, joint_delay_s: float) -> str | None:
         """What to set instead, where `joint_delay_s` is clearly off."""
-        found = self._estimate
+        found = None if self._looks is None else self._looks.estimate
         if found is None:
             return None
         off_s = found.delay_s - joint_delay_s

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_unit.pipeline import DepthPipeline, Misfit
+from edge_unit.pipeline import Misfit
 from edge_unit.pipeline.pose_misfit import STEPS
 from shared.clock import NS_PER_S
 from shared.files import StateFile
@@ -166,11 +166,11 @@ class Stance:
             self._gathered = _NOTHING
         return self._verdict
 
-    def watch(self, pipeline: DepthPipeline, captured_at_ns: int) -> Verdict:
-        """Look at the frame that was processed last, when that is due; the log tells when the verdict changes."""
-        if not self.due(captured_at_ns):
+    def watch(self, misfit: Misfit | None, layer: int, captured_at_ns: int) -> Verdict:
+        """Judge a frame, as `judge` does, where it was due; the log tells when the verdict changes."""
+        if misfit is None:
             return self._verdict
-        before, verdict = self._verdict, self.judge(pipeline.misfit(), pipeline.static_version, captured_at_ns)
+        before, verdict = self._verdict, self.judge(misfit, layer, captured_at_ns)
         if bool(verdict.reason) != bool(before.reason):
             logger.warning("%s", verdict.reason or "the camera stands where it stood, and sees")
         return verdict

@@ -4,51 +4,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edge_unit.pipeline.background_model import Reference, ReferenceLearner
-from edge_unit.pipeline.edge_halo import EdgeHalo
-from edge_unit.pipeline.expected_depth import BareRobot, RobotLayer, StaticLayer
-from edge_unit.pipeline.fit_check import Health, HealthCheck
-from edge_unit.pipeline.pose_misfit import Misfit, MisfitCheck
+from edge_unit.pipeline.fit_check import HealthCheck
+from edge_unit.pipeline.frame_result import FrameResult
+from edge_unit.pipeline.moving_model import EXACT, MovingModel
+from edge_unit.pipeline.pose_misfit import MisfitCheck
 from edge_unit.pipeline.pose_refinement import Refiner
-from edge_unit.pipeline.visibility import SeenBlocks, Visibility
-from edge_unit.pipeline.voxelizer import Voxelizer, Voxels
+from edge_unit.pipeline.stage_times import StageRunner
+from edge_unit.pipeline.static_model import Bodies, StaticModel
+from edge_unit.pipeline.visibility import Visibility
+from edge_unit.pipeline.voxelizer import Voxelizer
 from geometry.kernels import foreground, limits
-from geometry.rendering import Links
 from shared.camera import Intrinsics
 from shared.cell import Cell
-from shared.clock import stage_ns
 from shared.errors import InputError
 from shared.lattice import Lattice
 from shared.settings import FilterSettings
-from shared.transforms import inverse, validated
+from shared.transforms import validated
 
 Kind = TypeVar("Kind")
-
-EDGE_RADIUS_WIDTH_PX = 1280
-"""`edge_radius_px` is given for this width; an edge's blur covers the same angle at every resolution."""
-
-EXACT: ArrayLike = 0.0
-"""The uncertainty of joints that are known."""
-
-
-@dataclass(frozen=True)
-class StageTimes:
-    """Nanoseconds that the stages of the last frame took."""
-
-    expected_ns: int
-    points_ns: int
-    voxels_ns: int
-
-    @property
-    def total_ns(self) -> int:
-        """All stages together."""
-        return self.expected_ns + self.points_ns + self.voxels_ns
 
 
 class DepthPipeline:
@@ -80,94 +59,71 @@ class DepthPipeline:
         self.cell = _of_type(cell, Cell, "cell")
         self.settings = FilterSettings() if settings is None else _of_type(settings, FilterSettings, "settings")
         self.T_world_camera = validated(T_world_camera, "T_world_camera")
-        self.reference: Reference | None = None
-        self.last = StageTimes(0, 0, 0)
-        self._limit_raw = np.empty(intrinsics.shape, np.uint16)
-        self._seen_limit_raw = np.empty(intrinsics.shape, np.uint16)
-        self._room_raw = np.empty(intrinsics.shape, np.uint16)
-        self._scratch_raw = np.empty((2, *intrinsics.shape), np.uint16)
-        self._unlearned = np.full(intrinsics.shape, np.nan, np.float32)
-        self._no_depth_raw = np.zeros(intrinsics.shape, np.uint16)
-        self._halo = EdgeHalo(intrinsics)
-        self._health = HealthCheck(intrinsics)
-        self._misfit = MisfitCheck(intrinsics)
-        self.static_version = 0
         self._voxelizer = self._voxelizer_of(cell, self.settings)
         self._visibility = self._visibility_of(cell, self.settings)
-        self._static = StaticLayer(intrinsics, cell.static)
-        self._objects = StaticLayer(intrinsics, cell.objects)
-        self._robot = RobotLayer(intrinsics, cell.robot, self.settings.robot_padding_m)
-        self._bare_robot = BareRobot(intrinsics, cell.robot)
-        self._forget_frame()
-        self._place_links()
-        self._static.draw(self.T_world_camera)
-        self._objects.draw(self.T_world_camera)
-        self._renew_static()
+        self._health = HealthCheck(intrinsics)
+        self._misfit = MisfitCheck(intrinsics)
+        self._moving = MovingModel(intrinsics, cell.robot, self.T_world_camera, self.settings)
+        self._static = StaticModel(intrinsics, Bodies.of(intrinsics, cell, self.T_world_camera), self.settings)
 
     # ------------------------------------------------------------------ what a frame goes through
 
     def process(
-        self, depth: NDArray[np.uint16], joints: ArrayLike | None, *, joint_uncertainty_rad: ArrayLike = EXACT
-    ) -> Voxels:
-        """Obstacle voxels of one frame.
+        self,
+        depth: NDArray[np.uint16],
+        joints: ArrayLike | None,
+        *,
+        joint_uncertainty_rad: ArrayLike = EXACT,
+        with_misfit: bool = False,
+    ) -> FrameResult:
+        """Find the obstacle voxels of one frame, what it looks through, and how well it fits what is known.
 
         Args:
             depth: (H, W) uint16 in units of depth_scale_m, 0 where nothing was measured.
             joints: (n,) rad (m where prismatic) at the frame's time; None when unknown: then the robot is
                 reported, not filtered.
             joint_uncertainty_rad: how far each joint may be off, one number or (n,); it widens the padding.
+            with_misfit: compare the frame with places close to the camera's pose, too.
 
         Raises:
             InputError: depth or joints have the wrong type, shape or values.
         """
         depth_raw = self.intrinsics.check_depth(depth)
-        started = stage_ns()
-        self._place_robot(joints, joint_uncertainty_rad)
-        expected = stage_ns()
-        found = self._voxelizer.count(depth_raw, self._room_raw, self._minimum_raw, self._robot, self._halo)
-        counted = stage_ns()
-        voxels = self._voxelizer.keep_dense(found)
-        finished = stage_ns()
-        self._depth_raw = depth_raw
-        self.last = StageTimes(expected - started, counted - expected, finished - counted)
-        return voxels
+        known, settings = self._static.images, self.settings
+        stages = StageRunner()
+        robot = stages.run("expected", self._moving.place, joints, joint_uncertainty_rad)
+        voxels = self._voxelizer.voxels(depth_raw, known.room_raw, known.minimum_raw, robot, self._static.halo, stages)
+        seen = stages.run("seen", self._visibility.look, depth_raw, known.seen_limit_raw, robot.near_raw)
+        health = stages.run("health", self._health.check, depth_raw, known.depth_raw, robot.near_raw, settings)
+        misfit = None
+        if with_misfit:
+            standing = known.standing_raw
+            misfit = stages.run("misfit", self._misfit.check, depth_raw, standing, robot.near_raw, settings)
+        return FrameResult(voxels, seen, health, stages.times(), misfit)
 
     def foreground(
         self, depth: NDArray[np.uint16], joints: ArrayLike | None, *, joint_uncertainty_rad: ArrayLike = EXACT
     ) -> NDArray[np.bool_]:
-        """The pixels (H, W) that survive the filter; arguments and errors as in `process`."""
-        depth_raw = self.intrinsics.check_depth(depth)
-        self._place_robot(joints, joint_uncertainty_rad)
+        """Return the pixels (H, W) that survive the filter; arguments and errors as in `process`."""
+        depth_raw, known = self.intrinsics.check_depth(depth), self._static.images
+        robot = self._moving.place(joints, joint_uncertainty_rad)
         mask = np.empty(self.intrinsics.shape, np.uint8)
-        self._filter(depth_raw, mask)
+        foreground.foreground_mask(
+            depth_raw, known.room_raw, robot.near_raw, robot.span_raw, robot.columns, known.minimum_raw, mask
+        )
+        self._static.halo.drop(depth_raw, mask)
         return mask.view(np.bool_)
 
     def expected_depth(
         self, joints: ArrayLike | None, *, joint_uncertainty_rad: ArrayLike = EXACT
     ) -> NDArray[np.float32]:
-        """Depth (H, W) in metres of the nearest known surface, unpadded; inf where nothing is known.
+        """Return the depth (H, W) in metres of the nearest known surface, unpadded; inf where nothing is known.
 
         Without joints the robot is not known. The uncertainty pads the filter only, never what is expected.
         """
-        nearest_m = self._static_depth_m.copy()
-        if self._links is not None and joints is not None:
-            self._check_uncertainty(joint_uncertainty_rad)
-            self._bare_robot.lower(self._links.place(joints), nearest_m)
+        nearest_m = self._static.images.depth_m.copy()
+        self._moving.lower(joints, joint_uncertainty_rad, nearest_m)
         return nearest_m
-
-    def seen(self) -> SeenBlocks:
-        """The blocks of the cell that the last frame looked through."""
-        return self._visibility.look(
-            self._depth_raw, self._seen_limit_raw, self._robot.near_raw, self.settings.seen_share_min
-        )
-
-    def health(self) -> Health:
-        """How well the last frame fits what is known."""
-        return self._health.check(self._depth_raw, self._static_raw, self._robot.near_raw, self.settings)
-
-    def misfit(self) -> Misfit:
-        """How badly the last frame fits what is known, from here and from places close by."""
-        return self._misfit.check(self._depth_raw, self._standing_raw, self._robot.near_raw, self.settings)
 
     # ------------------------------------------------------------------ learning the empty cell
 
@@ -190,7 +146,7 @@ class DepthPipeline:
         return learner.reference()
 
     def learner(self) -> ReferenceLearner:
-        """A learner for this camera, to be fed with `learn_frame`."""
+        """Return a learner for this camera, to be fed with `learn_frame`."""
         return ReferenceLearner(self.intrinsics, self._noise_per_m, self.settings.range_max_m)
 
     def learn_frame(self, learner: ReferenceLearner, depth: NDArray[np.uint16], joints: ArrayLike | None) -> None:
@@ -203,44 +159,48 @@ class DepthPipeline:
         depth_raw = self.intrinsics.check_depth(depth)
         if self.cell.robot is not None and joints is None:
             raise InputError("learn: expected joints with every frame, for the robot must not be learned as background")
-        self._place_robot(joints, EXACT, hidden=self._fixed_links)
-        learner.add(depth_raw, self._robot.near_raw, self._robot.span_raw)
+        robot = self._moving.place(joints, without_fixed_links=True)
+        learner.add(depth_raw, robot.near_raw, robot.span_raw)
 
     def use(self, reference: Reference | None) -> None:
-        """From now on `reference` is part of the static layer; None takes it out.
+        """Make `reference` part of the static layer from now on; None takes it out.
 
         Raises:
             InputError: it is no reference, or was learned by a camera of another resolution; the old one stays.
         """
-        if reference is not None and _of_type(reference, Reference, "reference").depth_m.shape != self.intrinsics.shape:
-            raise InputError(
-                f"reference: expected images of {self.intrinsics.shape} (height, width), got {reference.depth_m.shape}"
-            )
-        self.reference = reference
-        self._renew_static()
+        self._static.use(None if reference is None else _of_type(reference, Reference, "reference"))
+
+    @property
+    def reference(self) -> Reference | None:
+        """The background model in use."""
+        return self._static.reference
 
     # ------------------------------------------------------------------ refining the pose
 
     def without_robot(self, depth: NDArray[np.uint16], joints: ArrayLike | None) -> NDArray[np.uint16]:
-        """A copy of a frame (H, W) in which nothing is measured where the padded robot may stand; errors as `process`.
+        """Copy a frame (H, W), with nothing measured where the padded robot may stand; errors as `process`.
 
         Without joints the robot stays in the picture: it may be anywhere.
         """
         bare = self.intrinsics.check_depth(depth).copy()
-        self._place_robot(joints, EXACT)
-        bare[self._robot.near_raw < limits.RAW_MAX] = 0
+        bare[self._moving.place(joints).near_raw < limits.RAW_MAX] = 0
         return bare
 
     def refiner(self) -> Refiner:
-        """Finds a better pose by the CAD, from frames of `without_robot`; `move` makes it count."""
-        return Refiner(self.intrinsics, self.T_world_camera, _depth_m(self._cad_w()), self._noise_per_m)
+        """Return what finds a better pose by the CAD, from frames of `without_robot`; `move` makes it count."""
+        return Refiner(self.intrinsics, self.T_world_camera, self._static.bodies.depth_m(), self._noise_per_m)
 
     # ------------------------------------------------------------------ what may change while it runs
 
     @property
     def lattice(self) -> Lattice:
-        """On which voxels are reported."""
+        """The lattice on which voxels are reported."""
         return self._voxelizer.lattice
+
+    @property
+    def static_version(self) -> int:
+        """A number that rises whenever what stands still, or is known of it, changes."""
+        return self._static.version
 
     def apply(self, settings: FilterSettings) -> None:
         """Work with other settings from now on.
@@ -251,7 +211,7 @@ class DepthPipeline:
         self.adopt(self.cell, settings)
 
     def use_cell(self, cell: Cell) -> None:
-        """The cell is another from now on, or its known objects stand elsewhere.
+        """Work with another cell from now on, or with known objects that stand elsewhere.
 
         Raises:
             InputError: it is no cell, or its lattice would be too large; the old one stays.
@@ -259,7 +219,7 @@ class DepthPipeline:
         self.adopt(cell, self.settings)
 
     def adopt(self, cell: Cell, settings: FilterSettings) -> None:
-        """Cell and settings are others from now on: both, or neither when one of them cannot be.
+        """Work with another cell and other settings from now on: both, or neither when one of them cannot be.
 
         Only what changed is prepared anew: robot and meshes that are the same objects as before are kept.
 
@@ -268,33 +228,20 @@ class DepthPipeline:
         """
         _of_type(cell, Cell, "cell")
         _of_type(settings, FilterSettings, "settings")
-        intrinsics, old_cell, old_settings = self.intrinsics, self.cell, self.settings
-        same_robot = cell.robot is old_cell.robot
         voxelizer, visibility = self._voxelizer, self._visibility
-        if settings != old_settings or cell.lattice(settings.voxel_size_m) != self.lattice:
+        if settings != self.settings or cell.lattice(settings.voxel_size_m) != self.lattice:
             voxelizer = self._voxelizer_of(cell, settings)
-        if settings != old_settings or not _same_box(cell, old_cell):
+        if settings != self.settings or not _same_box(cell, self.cell):
             visibility = self._visibility_of(cell, settings)
-        robot, bare_robot = self._robot, self._bare_robot
-        if not same_robot or settings.robot_padding_m != old_settings.robot_padding_m:
-            robot = RobotLayer(intrinsics, cell.robot, settings.robot_padding_m)
-        if not same_robot:
-            bare_robot = BareRobot(intrinsics, cell.robot)
-        static = self._static.of(cell.static)
-        objects = self._objects.of(cell.objects)
-        static.draw(self.T_world_camera)
-        objects.draw(self.T_world_camera)
+        moving = self._moving.changed(cell.robot, settings, self.T_world_camera)
+        bodies = self._static.bodies.of_cell(cell, self.T_world_camera)
         # Nothing from here on can fail.
         self.cell, self.settings = cell, settings
-        self._voxelizer, self._visibility = voxelizer, visibility
-        self._robot, self._bare_robot = robot, bare_robot
-        self._static, self._objects = static, objects
-        self._forget_frame()
-        self._place_links()
-        self._renew_static()
+        self._voxelizer, self._visibility, self._moving = voxelizer, visibility, moving
+        self._static.change(bodies, settings)
 
     def move(self, T_world_camera: ArrayLike, *, refined: bool = False) -> None:
-        """The camera's pose is another from now on.
+        """Take another pose of the camera from now on.
 
         What was learned belonged to the old place and is void, unless the pose was only `refined`: then the camera
         did not move, we merely know better where it stands.
@@ -303,100 +250,14 @@ class DepthPipeline:
             InputError: the pose is no rigid transform; the old one stays.
         """
         self.T_world_camera = validated(T_world_camera, "T_world_camera")
-        if not refined:
-            self.reference = None
         self._voxelizer.place(self.T_world_camera)
         self._visibility.place(self.T_world_camera)
-        self._forget_frame()
-        self._place_links()
-        self._static.draw(self.T_world_camera)
-        self._objects.draw(self.T_world_camera)
-        self._renew_static()
+        self._moving.move(self.T_world_camera)
+        if not refined:
+            self._static.reference = None
+        self._static.change(self._static.bodies.drawn(self.T_world_camera), self.settings)
 
-    # ------------------------------------------------------------------ the stages
-
-    def _place_robot(
-        self, joints: ArrayLike | None, joint_uncertainty_rad: ArrayLike, hidden: NDArray[np.bool_] | None = None
-    ) -> None:
-        """Draw the padded robot as it stood when the frame was taken."""
-        if self._links is None:
-            return
-        uncertainty = self._check_uncertainty(joint_uncertainty_rad)
-        if joints is None:
-            self._robot.forget()
-            return
-        settings = self.settings
-        T_camera_link = self._links.place(joints)
-        padding_m, most_m = self._robot.padding_m, settings.robot_padding_m
-        if uncertainty is not None:
-            padding_m = (padding_m + self._links.displacement_m(uncertainty)).astype(np.float32)
-            most_m = float(padding_m.max(initial=0.0))
-        self._robot.draw(
-            T_camera_link,
-            padding_m,
-            settings.margin_noise_gain * self._noise_per_m,
-            # The padded surface stands before the true one by the padding.
-            settings.robot_depth_m + most_m,
-            hidden,
-        )
-
-    def _filter(self, depth_raw: NDArray[np.uint16], mask: NDArray[np.uint8]) -> None:
-        """Mark with 1, else 0, what is nearer than all that stands still, and not robot."""
-        self._depth_raw = depth_raw
-        foreground.foreground_mask(
-            depth_raw,
-            self._room_raw,
-            self._robot.near_raw,
-            self._robot.span_raw,
-            self._robot.columns,
-            self._minimum_raw,
-            mask,
-        )
-        self._halo.drop(depth_raw, mask)
-
-    def _forget_frame(self) -> None:
-        """The last frame showed another place, or was filtered by other rules: until the next, nothing is seen."""
-        self._robot.forget()
-        self._depth_raw = self._no_depth_raw
-
-    def _place_links(self) -> None:
-        """Place the robot's base before the camera."""
-        robot = self.cell.robot
-        self._links = Links(robot, inverse(self.T_world_camera)) if robot else None
-        self._fixed_links = np.array([not link.moving for link in (robot.links if robot else ())], np.bool_)
-
-    def _renew_static(self) -> None:
-        """Limits of all that stands still: CAD and what was learned, less margins, nearest over the blur of an edge."""
-        settings, camera = self.settings, self.intrinsics
-        w = self._cad_w()
-        learned = self.reference
-        reference_m = learned.depth_m if learned else self._unlearned
-        spread_m = learned.spread_m if learned else self._unlearned
-        cad_noise_per_m = settings.margin_noise_gain * self._noise_per_m
-        raw, scratch = self._scratch_raw
-        limits.static_limit_raw(
-            w,
-            reference_m,
-            spread_m,
-            settings.margin_base_m,
-            cad_noise_per_m,
-            settings.reference_margin_base_m,
-            settings.reference_spread_gain,
-            settings.range_max_m,
-            camera.depth_scale_m,
-            raw,
-        )
-        radius_px = round(settings.edge_radius_px * camera.width / EDGE_RADIUS_WIDTH_PX)
-        limits.nearest_over(raw, radius_px, scratch, self._limit_raw)
-        self._minimum_raw = min(max(int(np.ceil(settings.range_min_m / camera.depth_scale_m)), 1), limits.RAW_MAX)
-        np.subtract(np.maximum(self._limit_raw, self._minimum_raw), self._minimum_raw, out=self._room_raw)
-        self._halo.renew(w, settings.static_padding_m, settings.margin_base_m, cad_noise_per_m)
-        self._halo.lower(self._limit_raw, self._seen_limit_raw)
-        self._static_depth_m = np.fmin(_depth_m(w), reference_m)
-        self._static_raw = self._raw(self._static_depth_m)
-        # Known objects may be carried away before anyone tells; that is no reason to doubt where the camera stands.
-        self._standing_raw = self._raw(np.fmin(_depth_m(self._static.nearest_w), reference_m))
-        self.static_version += 1
+    # ------------------------------------------------------------------ its parts
 
     def _voxelizer_of(self, cell: Cell, settings: FilterSettings) -> Voxelizer:
         return Voxelizer(self.intrinsics, self.T_world_camera, cell.lattice(settings.voxel_size_m), settings)
@@ -408,35 +269,9 @@ class DepthPipeline:
             cell.box_min_m,
             cell.box_max_m,
             settings.seen_block_size_m,
+            settings.seen_share_min,
             self.intrinsics.disparity_noise_m(settings.stereo_subpixel_px),
         )
-
-    def _cad_w(self) -> NDArray[np.float32]:
-        """Inverse depth (H, W) of CAD and known objects in 1/m, 0 where there are none."""
-        return np.asarray(np.maximum(self._static.nearest_w, self._objects.nearest_w))
-
-    def _raw(self, depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
-        """Depth (H, W) in raw units, 0 where nothing is known or it is too far for 16 bits."""
-        raw = np.nan_to_num(depth_m / self.intrinsics.depth_scale_m, nan=0.0, posinf=0.0)
-        return np.where(raw < limits.RAW_MAX, raw, 0.0).astype(np.uint16)
-
-    def _check_uncertainty(self, joint_uncertainty_rad: ArrayLike) -> NDArray[np.float64] | None:
-        """The uncertainty (n,) of each joint; None when there is none."""
-        if joint_uncertainty_rad is EXACT:
-            return None
-        robot = self.cell.robot
-        count = robot.joint_count if robot else 0
-        try:
-            uncertainty = np.asarray(joint_uncertainty_rad, np.float64)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"joint_uncertainty_rad: expected numbers, got {joint_uncertainty_rad!r}") from error
-        sound = (uncertainty >= 0.0) & np.isfinite(uncertainty)
-        if uncertainty.shape not in ((), (count,)) or not sound.all():
-            raise InputError(
-                f"joint_uncertainty_rad: expected one finite number of at least 0, or {count}, "
-                f"got {uncertainty.tolist()}"
-            )
-        return np.array(np.broadcast_to(uncertainty, (count,))) if uncertainty.any() else None
 
     @property
     def _noise_per_m(self) -> float:
@@ -446,13 +281,6 @@ class DepthPipeline:
 
 def _same_box(one: Cell, other: Cell) -> bool:
     return np.array_equal(one.box_min_m, other.box_min_m) and np.array_equal(one.box_max_m, other.box_max_m)
-
-
-def _depth_m(w_per_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depth (H, W) in metres of inverse depth, inf where that is 0."""
-    depth_m = np.full(w_per_m.shape, np.inf, np.float32)
-    np.divide(1.0, w_per_m, out=depth_m, where=w_per_m > 0.0)
-    return depth_m
 
 
 def _of_type(value: Kind, kind: type, name: str) -> Kind:

@@ -13,14 +13,11 @@ from edge_unit.pipeline.voxelizer import Voxels
 from geometry.kernels import seen as kernels
 from geometry.rendering.mesh_renderer import NEAR_PLANE_M
 from shared.camera import Intrinsics
-from shared.lattice import Lattice
+from shared.lattice import Lattice, block_lattice
 from shared.transforms import Transform, inverse
 
 ROWS_LOOKED_AT = 360
 """Of a larger image only every second row is looked at, or every third: a block of 100 mm is 16 rows at 4 m."""
-
-MAX_BLOCKS = 2**17
-"""16 kB of bits before compression; in a cell that needs more, the blocks are larger."""
 
 EDGE_SHARE = 1e-3
 """Of a voxel: how far inside of its faces it is looked at, so that rounding counts no neighbour."""
@@ -76,13 +73,16 @@ class Visibility:
         box_min_m: NDArray[np.float64],
         box_max_m: NDArray[np.float64],
         block_size_m: float,
+        share_min: float,
         noise_per_m: float,
     ) -> None:
-        """`noise_per_m` is the `c` of the camera's `sigma(z) = c * z**2`."""
-        while np.ceil((box_max_m - box_min_m) / block_size_m).prod() > MAX_BLOCKS:
-            block_size_m *= 2.0
-        self.lattice = Lattice.covering(box_min_m, box_max_m, block_size_m)
+        """A block is seen where at least `share_min` of its rays pass through it.
+
+        `noise_per_m` is the `c` of the camera's `sigma(z) = c * z**2`.
+        """
+        self.lattice = block_lattice(box_min_m, box_max_m, block_size_m)
         self._intrinsics = intrinsics
+        self._share_min = share_min
         self._noise_per_m = SIGMAS * noise_per_m
         self._blocks = np.empty(self.lattice.cell_count, np.int32)
         self._views = np.empty((self.lattice.cell_count, 5), np.int32)
@@ -117,7 +117,6 @@ class Visibility:
         depth_raw: NDArray[np.uint16],
         static_limit_raw: NDArray[np.uint16],
         robot_near_raw: NDArray[np.uint16],
-        share_min: float,
     ) -> SeenBlocks:
         """The blocks that a frame looks through; images (H, W)."""
         kernels.seen_blocks(
@@ -127,7 +126,7 @@ class Visibility:
             self._blocks,
             self._views,
             self._number,
-            share_min,
+            self._share_min,
             self._rows_apart,
             self._reach_raw,
             self._seen,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from edge_unit.pipeline.edge_halo import EdgeHalo
 from edge_unit.pipeline.expected_depth import RobotLayer
+from edge_unit.pipeline.stage_times import StageRunner
 from geometry.kernels import density, points, voxelize
 from shared.camera import Intrinsics
 from shared.lattice import Lattice
@@ -90,7 +91,23 @@ class Voxelizer:
         self._degrees_per_column = math.degrees(2.0 * math.atan(camera.width / (2.0 * camera.fx))) / camera.width
         self._degrees_per_row = math.degrees(2.0 * math.atan(camera.height / (2.0 * camera.fy))) / camera.height
 
-    def count(
+    def voxels(
+        self,
+        depth_raw: NDArray[np.uint16],
+        room_raw: NDArray[np.uint16],
+        minimum_raw: int,
+        robot: RobotLayer,
+        halo: EdgeHalo,
+        stages: StageRunner,
+    ) -> Voxels:
+        """Return the voxels that hold enough of the foreground of `depth_raw` (H, W).
+
+        `room_raw` (H, W) and `minimum_raw` as in `foreground.foreground_mask`.
+        """
+        found = stages.run("foreground", self._count, depth_raw, room_raw, minimum_raw, robot, halo)
+        return stages.run("density", self._keep_dense, found)
+
+    def _count(
         self,
         depth_raw: NDArray[np.uint16],
         room_raw: NDArray[np.uint16],
@@ -98,10 +115,7 @@ class Voxelizer:
         robot: RobotLayer,
         halo: EdgeHalo,
     ) -> int:
-        """Count the foreground of `depth_raw` (H, W); returns how many voxels hold any. `keep_dense` must follow.
-
-        `room_raw` (H, W) and `minimum_raw` as in `foreground.foreground_mask`.
-        """
+        """Count the foreground on the lattice; returns how many voxels hold any."""
         return points.count_foreground(
             depth_raw,
             room_raw,
@@ -123,8 +137,8 @@ class Voxelizer:
             self._touched,
         )
 
-    def keep_dense(self, found: int) -> Voxels:
-        """The voxels that hold enough points, and forget all `found` of them."""
+    def _keep_dense(self, found: int) -> Voxels:
+        """Return the voxels that hold enough points, and forget all `found` of them."""
         settings = self._settings
         # In the order of memory: judging them is then several times as fast, and the kept ones come sorted.
         self._touched[:found].sort()

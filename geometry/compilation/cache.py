@@ -31,7 +31,9 @@ from shared.errors import JitCacheError
 
 logger = logging.getLogger(__name__)
 
-VARIABLES = ("CELLWATCH_JIT_CACHE", "NUMBA_CACHE_DIR")
+NUMBA_VARIABLE = "NUMBA_CACHE_DIR"
+
+VARIABLES = ("CELLWATCH_JIT_CACHE", NUMBA_VARIABLE)
 
 KERNELS = Path(__file__).resolve().parents[1] / "kernels"
 
@@ -68,6 +70,11 @@ def settle(directory: Path | str | None = None) -> Path:
         VARIABLES[0],
     )
     return _use(private)
+
+
+def folder_beside(name: str) -> Path:
+    """Return the folder `name` beside those of the kernels, wherever they were settled; it need not exist."""
+    return Path(os.environ[NUMBA_VARIABLE]).parent / name
 
 
 def settle_for(target: Target, directory: Path) -> Path:
@@ -131,7 +138,7 @@ def _is_whole(content: bytes) -> bool:
 
 
 def _tell_numba(folder: Path) -> None:
-    os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    os.environ[NUMBA_VARIABLE] = str(folder)
     if "numba" in sys.modules:
         # It reads the variable only when it is imported.
         import numba

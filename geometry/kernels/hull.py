@@ -18,13 +18,18 @@ EDGES = np.array(
 
 @kernel
 def sample_faces(
-    vertices_m: NDArray[np.float32], faces: NDArray[np.int32], spacing_m: float, samples_m: NDArray[np.float32]
+    vertices_m: NDArray[np.float32],
+    faces: NDArray[np.int32],
+    spacing_m: float,
+    first: int,
+    samples_m: NDArray[np.float32],
 ) -> int:
-    """Cover triangles with points at most `spacing_m` apart; returns how many.
+    """Cover triangles with points at most `spacing_m` apart; returns how many they are.
 
-    Writes to `samples_m` (S, 3) as far as it reaches; call it once with S = 0 to learn the number.
+    Writes those from number `first` on to `samples_m` (S, 3) as far as it reaches; call it once with S = 0 to learn
+    the number.
     """
-    number = 0
+    number = -first
     for f in range(len(faces)):
         a, b, c = vertices_m[faces[f, 0]], vertices_m[faces[f, 1]], vertices_m[faces[f, 2]]
         longest = 0.0
@@ -32,14 +37,18 @@ def sample_faces(
             p, q = vertices_m[faces[f, k]], vertices_m[faces[f, (k + 1) % 3]]
             longest = max(longest, (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
         steps = max(math.ceil(math.sqrt(longest) / spacing_m), 1)
+        points = (steps + 1) * (steps + 2) // 2
+        if number >= len(samples_m) or number + points <= 0:
+            number += points
+            continue
         for i in range(steps + 1):
             for j in range(steps + 1 - i):
-                if number < len(samples_m):
+                if 0 <= number < len(samples_m):
                     s, t = i / steps, j / steps
                     for k in range(3):
                         samples_m[number, k] = a[k] + s * (b[k] - a[k]) + t * (c[k] - a[k])
                 number += 1
-    return number
+    return number + first
 
 
 @kernel

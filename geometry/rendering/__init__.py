@@ -4,6 +4,7 @@
 In the order of the flow:
 
     vertex_offsets  how a mesh grows by a padding
+    hull_store      hulls kept on disk
     padded_hull     a link as the solid that reaches a few centimetres around it
     link_poses      the robot's links as they stand before one camera
     mesh_renderer   meshes and links drawn into buffers of inverse depth

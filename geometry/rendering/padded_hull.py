@@ -7,13 +7,18 @@ smooth, closed and has few triangles, whatever the mesh was like.
 
 from __future__ import annotations
 
+import importlib.metadata
 import logging
+from functools import lru_cache
+from pathlib import Path
 
 import manifold3d
 import numpy as np
 from numpy.typing import NDArray
 
+from geometry.compilation.cache import folder_beside
 from geometry.kernels import hull as kernels
+from geometry.rendering.hull_store import FOLDER, HullStore, state_of_code
 from shared.errors import InputError
 from shared.meshes import TriangleMesh
 
@@ -31,6 +36,10 @@ GRID_NODES_MAX = 2_000_000
 SAMPLE_SHARE = 0.1
 """Spacing of the points that stand for the mesh in parts of the distance; it changes that by less than a hundredth."""
 
+SAMPLES_AT_ONCE = 1_000_000
+"""Some 60 MB while they are thinned out. Long, thin triangles, of which CAD is full, are covered by many more than are
+needed: all at once took 1.7 GB for a smooth cylinder of 1.2 m."""
+
 SIMPLIFY_MAX_M, SIMPLIFY_SHARE = 0.002, 1.0 / 15.0
 """How far the simplified hull may leave the grid's, at most and in parts of the distance: half of it would mean nearly
 twice as many triangles to draw."""
@@ -47,17 +56,35 @@ _hulls: dict[tuple[str, float], TriangleMesh] = {}
 def hull_around(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
     """The outer surface at `distance_m` from `mesh`, within some 3 mm; closed, however open the mesh was.
 
-    Takes some hundredths of a second; the same mesh has its hull at once.
+    Takes some hundredths of a second, and seconds for fine CAD of a large link; the same mesh has its hull at once, at
+    the next start from the disk.
 
     Raises:
         InputError: the distance is below `DISTANCE_MIN_M`.
     """
     if not distance_m >= DISTANCE_MIN_M:
         raise InputError(f"hull of {mesh.name}: expected a distance of at least {DISTANCE_MIN_M} m, got {distance_m}")
-    hull = _hulls.pop((mesh.sha256, distance_m), None) or _make_hull(mesh, distance_m)
+    hull = _hulls.pop((mesh.sha256, distance_m), None) or _kept_hull(mesh, distance_m)
     while len(_hulls) >= HULLS_MAX:
         del _hulls[next(iter(_hulls))]
     _hulls[mesh.sha256, distance_m] = hull
+    return hull
+
+
+@lru_cache(maxsize=1)
+def _store() -> HullStore:
+    sources = (Path(__file__), Path(kernels.__file__))
+    libraries = (f"{name} {importlib.metadata.version(name)}" for name in ("manifold3d", "numpy"))
+    return HullStore(folder_beside(FOLDER), state_of_code(sources, libraries))
+
+
+def _kept_hull(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
+    """The hull from the disk; where it is not there, it is made and kept."""
+    store = _store()
+    hull = store.load(mesh, distance_m)
+    if hull is None:
+        hull = _make_hull(mesh, distance_m)
+        store.save(mesh, distance_m, hull)
     return hull
 
 
@@ -84,18 +111,24 @@ def _distance(
 ) -> NDArray[np.float32]:
     """Distance (nx, ny, nz) in metres of the grid's nodes from the mesh, as far as it matters."""
     spacing_m = SAMPLE_SHARE * distance_m
-    number = kernels.sample_faces(mesh.vertices, mesh.faces, spacing_m, np.empty((0, 3), np.float32))
-    samples_m = np.empty((number, 3), np.float32)
-    kernels.sample_faces(mesh.vertices, mesh.faces, spacing_m, samples_m)
-    # Fine meshes give many more points than are needed; one of each grain will do.
-    grain = np.floor(samples_m / (0.5 * spacing_m)).astype(np.int64)
-    grain -= grain.min(axis=0)
-    _, first = np.unique(np.ravel_multi_index(tuple(grain.T), tuple(grain.max(axis=0) + 1)), return_index=True)
     reach = int(np.ceil((distance_m + grid_m) / grid_m))
     far_m = distance_m + 2.0 * grid_m
     squared_m2 = np.full(tuple(shape), far_m * far_m, np.float32)
-    kernels.spread_distance(samples_m[first], origin_m.astype(np.float32), np.float32(grid_m), reach, squared_m2)
+    number = kernels.sample_faces(mesh.vertices, mesh.faces, spacing_m, 0, np.empty((0, 3), np.float32))
+    for start in range(0, number, SAMPLES_AT_ONCE):
+        samples_m = np.empty((min(SAMPLES_AT_ONCE, number - start), 3), np.float32)
+        kernels.sample_faces(mesh.vertices, mesh.faces, spacing_m, start, samples_m)
+        samples_m = _thinned(samples_m, 0.5 * spacing_m)
+        kernels.spread_distance(samples_m, origin_m.astype(np.float32), np.float32(grid_m), reach, squared_m2)
     return np.sqrt(squared_m2)
+
+
+def _thinned(samples_m: NDArray[np.float32], grain_m: float) -> NDArray[np.float32]:
+    """Of points (S, 3) one for each grain: fine meshes give many more than are needed."""
+    grain = np.floor(samples_m / grain_m).astype(np.int64)
+    grain -= grain.min(axis=0)
+    _, first = np.unique(np.ravel_multi_index(tuple(grain.T), tuple(grain.max(axis=0) + 1)), return_index=True)
+    return samples_m[first]
 
 
 def _surface(field: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:

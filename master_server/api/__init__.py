@@ -8,6 +8,7 @@ It is assembled by `master_server.app`; this page re-exports nothing. In the ord
     image_requests  what units are asked to show
     history         the last minutes in a few figures
     metrics         what a monitoring system reads
+    services        what the routes of one application work with
     openapi         the API described, with examples for the cell that is watched
     routes/         each part of the API as HTTP
 """

@@ -13,9 +13,10 @@ import logging
 from typing import Any, Literal, NamedTuple
 
 from master_server.api.responses import Form, as_json, as_msgpack, map_fields, unseen_fields
-from master_server.core import MapView, Readable
-from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns, stage_ns
+from master_server.core import MapView, Readable, UnitState
+from shared.clock import NS_PER_MS, stage_ns
 from shared.errors import Refusal
+from shared.waiting import Clock, LoopClock, Timer
 
 logger = logging.getLogger(__name__)
 
@@ -51,7 +52,7 @@ class Picture:
         number: int,
         now_ns: int,
         view: MapView,
-        units: list[dict[str, Any]],
+        units: list[UnitState],
         unseen: dict[str, Any] | None,
     ) -> None:
         self.number = number
@@ -110,13 +111,15 @@ class Listener:
 
 
 class Stream:
-    """All listeners of one master, and the timer that looks when nobody reports."""
+    """All listeners of one master, and the timer that looks when nobody reports; it rests while nobody listens."""
 
-    def __init__(self, master: Readable) -> None:
+    def __init__(self, master: Readable, clock: Clock | None = None) -> None:
+        """`clock` is that of the running event loop by default."""
         self.picture: Picture | None = None
         self._master = master
+        self._clock = LoopClock() if clock is None else clock
         self.listeners: set[Listener] = set()
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer: Timer | None = None
         self._due_ns = 0
         self._looked_at_ns = 0
         self._number = 0
@@ -124,10 +127,6 @@ class Stream:
 
     def __len__(self) -> int:
         return len(self.listeners)
-
-    def start(self) -> None:
-        """Look by the clock from now on, also while nobody listens: that a unit fell silent is logged at its time."""
-        self._look()
 
     def stop(self) -> None:
         """Look no more."""
@@ -156,34 +155,32 @@ class Stream:
         """Something is another; look as soon as may be."""
         if not self.listeners:
             return
-        now_ns = monotonic_ns()
+        now_ns = self._clock.now_ns()
         cost_ns = 0 if self.picture is None else self.picture.cost_ns
         gap_ns = max(PERIOD_MIN_NS, round(cost_ns / COST_SHARE_MAX))
         at_ns = max(now_ns, self._looked_at_ns + gap_ns)
         if self._timer is None or at_ns < self._due_ns:
-            self._look_at(at_ns, now_ns)
+            self._look_at(at_ns)
 
-    def _look_at(self, at_ns: int, now_ns: int) -> None:
+    def _look_at(self, at_ns: int) -> None:
         if self._timer is not None:
             self._timer.cancel()
         self._due_ns = at_ns
-        delay_s = max(at_ns - now_ns, 0) / NS_PER_S
-        self._timer = asyncio.get_running_loop().call_later(delay_s, self._look)
+        self._timer = self._clock.call_at(at_ns, self._look)
 
     def _look(self) -> None:
-        now_ns = monotonic_ns()
+        now_ns = self._clock.now_ns()
         self._timer = None
         self._looked_at_ns = now_ns
-        # First of all, so that even a fault below only costs this one picture.
-        due_ns = self._master.next_change_ns(now_ns)
-        at_ns = now_ns + HEARTBEAT_NS
-        self._look_at(at_ns if due_ns is None else min(at_ns, due_ns + DUE_SLACK_NS), now_ns)
-        # Nobody needs it while nobody listens, but that states are judged, and so logged, at their time.
-        units = self._master.unit_states(now_ns)
         if not self.listeners:
             self.picture = None
             return
+        # First of all, so that even a fault below only costs this one picture.
+        due_ns = self._master.next_change_ns(now_ns)
+        at_ns = now_ns + HEARTBEAT_NS
+        self._look_at(at_ns if due_ns is None else min(at_ns, due_ns + DUE_SLACK_NS))
         began_ns = stage_ns()
+        units = self._master.unit_states(now_ns)
         unseen = None
         if any(listener.wish.unseen for listener in self.listeners):
             unseen = unseen_fields(self._master.blocks_at(now_ns), self._master.seen_by(now_ns))

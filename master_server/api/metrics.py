@@ -7,14 +7,12 @@ Labels are ids, addresses and states of at most `MAX_UNITS` units; what a unit s
 from __future__ import annotations
 
 import importlib.metadata
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator
-from itertools import accumulate
 from typing import get_args
 
-from prometheus_client import CollectorRegistry, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
+from prometheus_client import CollectorRegistry, Histogram, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from master_server.api.map_stream import Stream
@@ -40,8 +38,9 @@ class Metrics(Collector):
         self._master = master
         self._stream = stream
         self._limits = limits
-        self._took = [0] * (len(BOUNDS_S) + 1)
-        self._took_ns = 0
+        self._took = Histogram(
+            "cellwatch_update_seconds", "From an update's last byte to its answer.", buckets=BOUNDS_S, registry=None
+        )
         self._refused: dict[int, int] = {}
         self._registry = CollectorRegistry()
         self._registry.register(self)
@@ -51,8 +50,7 @@ class Metrics(Collector):
         slot = self._master.registry.get(unit_id)
         slot.updates += 1
         slot.received_bytes += size_bytes
-        self._took[bisect_left(BOUNDS_S, took_ns / NS_PER_S)] += 1
-        self._took_ns += took_ns
+        self._took.observe(took_ns / NS_PER_S)
 
     def refused(self, status: int) -> None:
         """An update was refused; `status` is one of the few that the master has."""
@@ -91,21 +89,18 @@ class Metrics(Collector):
             info.add_metric((*unit, slot.serial, slot.record.model, slot.record.software), 1.0)
             for one in get_args(State):
                 states.add_metric((*unit, one), float(one == state))
-            for family, value in ((age, slot.age_s(now_ns)), (arrival_age, slot.arrival_age_s(now_ns))):
+            for family, value in ((age, slot.session.age_s(now_ns)), (arrival_age, slot.session.arrival_age_s(now_ns))):
                 if value is not None:
                     family.add_metric(unit, value)
-            fps.add_metric(unit, slot.fps)
-            voxels.add_metric(unit, len(slot.keys))
-            process.add_metric(unit, slot.health.process_ms / 1000.0)
+            fps.add_metric(unit, slot.session.fps)
+            voxels.add_metric(unit, len(self._master.map.keys_of(slot.id)))
+            process.add_metric(unit, slot.session.health.process_ms / 1000.0)
             updates.add_metric(unit, slot.updates)
             received.add_metric(unit, slot.received_bytes)
         yield from (info, states, age, arrival_age, fps, voxels, process, updates, received)
 
     def _updates(self) -> Iterator[Metric]:
-        names = [*(str(bound) for bound in BOUNDS_S), "+Inf"]
-        took = HistogramMetricFamily("cellwatch_update_seconds", "From an update's last byte to its answer.")
-        took.add_metric((), list(zip(names, accumulate(self._took), strict=True)), self._took_ns / NS_PER_S)
-        yield took
+        yield from self._took.collect()
         refused = CounterMetricFamily("cellwatch_updates_refused", "Updates refused, by status.", labels=("status",))
         for status, count in sorted(self._refused.items()):
             refused.add_metric((str(status),), count)

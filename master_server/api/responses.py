@@ -11,9 +11,9 @@ import ormsgpack
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
-from master_server.core import MapView, Readable
+from master_server.core import MapView, Readable, UnitState
 from shared.lattice import Lattice
-from shared.messages import LatticeDescription, Reason, State, VoxelsAnswer
+from shared.messages import LatticeDescription, Reason, VoxelsAnswer
 
 Form = Literal["indices", "centres", "keys"]
 
@@ -22,18 +22,6 @@ CENTRE_DECIMALS = 4
 
 MANY = 3
 """Blocks are told apart by up to as many units; with three, a hidden one and a dead one still leave one."""
-
-
-class UnitState(BaseModel):
-    """One unit in a message of the stream."""
-
-    id: int
-    ip: str
-    state: State
-    reason: str
-    cause: Reason | None = Field(default=None, description="The reason for programs.")
-    age_s: float | None = Field(description="Since the capture of its last frame.")
-    voxels: int
 
 
 class StreamMessage(VoxelsAnswer):

@@ -8,6 +8,7 @@ In the order of the flow:
     merged_map    the units' voxels, merged (Algorithm 9)
     units         the units' slots and how far each can be trusted (Algorithm 8)
     master        all of that held together, without a network
+    ticker        its tick, by the clock
     read_model    what readers see: a master, or a recording of one
 """
 
@@ -15,7 +16,8 @@ from master_server.core.master import MapView, Master
 from master_server.core.merged_map import MergedMap
 from master_server.core.read_model import Readable, ReadableCell
 from master_server.core.robot_joints import RobotJoints
-from master_server.core.units import Registry
+from master_server.core.ticker import Ticker
+from master_server.core.units import Registry, UnitState
 
 __all__ = [
     "MapView",
@@ -25,4 +27,6 @@ __all__ = [
     "ReadableCell",
     "Registry",
     "RobotJoints",
+    "Ticker",
+    "UnitState",
 ]

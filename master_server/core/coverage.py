@@ -8,24 +8,13 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.cell import Cell
 from shared.errors import WireError
 from shared.lattice import Lattice
 from shared.messages import Matrix, SeenReport
 from shared.wire import unpack_seen
 
-MAX_BLOCKS = 2**17
-"""As units have it; 128 KiB for each of them."""
-
 FACTOR_TOLERANCE = 1e-6
 """Block sizes are multiples of one another up to rounding."""
-
-
-def blocks_of(cell: Cell, block_size_m: float) -> Lattice:
-    """The cell's box in blocks; in a cell that needs more than MAX_BLOCKS, they are twice as large, and so on."""
-    while np.ceil((cell.box_max_m - cell.box_min_m) / block_size_m).prod() > MAX_BLOCKS:
-        block_size_m *= 2.0
-    return cell.lattice(block_size_m)
 
 
 class Coverage:

@@ -9,17 +9,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from master_server.cells.published import PublishedCell
-from master_server.core.coverage import Coverage, blocks_of
+from master_server.core.coverage import Coverage
 from master_server.core.merged_map import NO_KEYS, MergedMap
 from master_server.core.robot_joints import RobotJoints
-from master_server.core.units import Registry, Slot, sentence_of
+from master_server.core.units import Registry, Slot, UnitState, sentence_of
 from master_server.persistence import Store, beginning
 from shared.cell import Cell
 from shared.configuration import sentence
@@ -108,7 +107,7 @@ class Master:
         self.robot = RobotJoints(cell.robot.joint_names if cell.robot else None)
         self.listeners: list[Callable[[], None]] = []
         """Called after each change of what `view` says; time alone changes it too, see `next_change_ns`."""
-        self._begin_on(lattice, blocks_of(cell, settings.seen_block_size_m))
+        self._begin_on(lattice, cell.blocks(settings.seen_block_size_m))
 
     @property
     def cell(self) -> Cell:
@@ -137,7 +136,7 @@ class Master:
         self._changed()
         return InitializeAnswer(
             id=slot.id,
-            session=slot.session,
+            session=slot.session.number,
             versions=self._versions_for(slot),
             settings=self.settings,
             lattice=self.lattice_description,
@@ -158,28 +157,34 @@ class Master:
             WireError: keys or seen report are malformed; nothing was changed.
         """
         slot = self.registry.own(update.id, ip)
-        if update.session != slot.session:
+        if update.session != slot.session.number:
             raise Refusal(409, f"unit {slot.id}: this session is over, initialize again")
-        if update.sequence <= slot.sequence:
-            raise Refusal(409, f"unit {slot.id}: expected a sequence above {slot.sequence}, got {update.sequence}")
+        before = slot.session.sequence
+        if update.sequence <= before:
+            raise Refusal(409, f"unit {slot.id}: expected a sequence above {before}, got {update.sequence}")
         on_lattice = update.versions.lattice == self.versions.lattice
         keys = keys_from_bytes(update.keys, self.lattice.cell_count) if on_lattice else NO_KEYS
         if update.seen is not None and update.versions == self._versions_for(slot):
             self.coverage.report(slot.id, update.seen)
-        self._take_in(slot, update, keys, now_ns)
-        if self.judge(slot, now_ns)[0] == "live":
-            self.map.replace(slot.id, keys)
-        else:
-            self.map.withdraw(slot.id)
+        self.map.replace(slot.id, keys)
+        slot.session.take_in(update, now_ns)
+        for ended in update.done:
+            slot.end(ended.id, ended.outcome)
+        self._notice(slot, now_ns)
         self._changed()
         return self._answer(slot, update, now_ns)
 
     def judge(self, slot: Slot, now_ns: int) -> tuple[State, Reason | None]:
-        """A unit's state now, and why; a state other than the last one found is logged."""
-        state, cause = slot.judge(now_ns, self.versions, self.settings)
-        if state != slot.told_state:
-            slot.tell(state, cause)
-        return state, cause
+        """A unit's state now, and why."""
+        return slot.judge(now_ns, self.versions, self.settings)
+
+    def tick(self, now_ns: int) -> None:
+        """Notice what time alone changed: log units whose state is another one, end commands that were not answered.
+
+        No answer waits for it: each is of its own `now_ns`.
+        """
+        for slot in self.registry:
+            self._notice(slot, now_ns)
 
     def units(self, now_ns: int) -> list[UnitRow]:
         """One row a unit."""
@@ -187,26 +192,20 @@ class Master:
         for slot in self.registry:
             pose = slot.T_world_camera
             range_m = None if pose is None else self.coverage.range_m(slot.id, pose)
-            rows.append(slot.row(now_ns, *self.judge(slot, now_ns), None if range_m is None else round(range_m, 2)))
+            voxels = len(self.map.keys_of(slot.id))
+            range_m = None if range_m is None else round(range_m, 2)
+            rows.append(slot.row(now_ns, *self.judge(slot, now_ns), voxels, range_m))
         return rows
 
-    def unit_states(self, now_ns: int) -> list[dict[str, Any]]:
-        """Of each row what a stream tells at every change: id, ip, state, reason, cause, age and voxels."""
+    def unit_states(self, now_ns: int) -> list[UnitState]:
+        """Of each row what a stream tells at every change."""
         rows = []
         for slot in self.registry:
             state, cause = self.judge(slot, now_ns)
-            age_s = slot.age_s(now_ns)
-            rows.append(
-                {
-                    "id": slot.id,
-                    "ip": slot.ip,
-                    "state": state,
-                    "reason": sentence_of(cause),
-                    "cause": cause,
-                    "age_s": None if age_s is None else round(age_s, 4),
-                    "voxels": len(slot.keys),
-                }
-            )
+            age_s = slot.session.age_s(now_ns)
+            voxels = len(self.map.keys_of(slot.id))
+            age_s = None if age_s is None else round(age_s, 4)
+            rows.append(UnitState(slot.id, slot.ip, state, sentence_of(cause), cause, age_s, voxels))
         return rows
 
     def forget(self, unit_id: int) -> None:
@@ -253,17 +252,18 @@ class Master:
 
     def view(self, now_ns: int) -> MapView:
         """The union of what live units report, and what it lacks (Algorithm 9)."""
-        causes = []
-        ages_s = []
+        causes: list[Reason] = []
+        live: list[int] = []
+        oldest_s: float | None = None
         for slot in self.registry:
             state, cause = self.judge(slot, now_ns)
             if state != "live":
                 assert cause is not None
-                self.map.withdraw(slot.id)
                 causes.append(_of_unit(slot, cause.code, f"is {state}: {cause.sentence}", cause.numbers))
                 continue
-            self.map.replace(slot.id, slot.keys)
-            ages_s.append(slot.age_s(now_ns) or 0.0)
+            live.append(slot.id)
+            age_s = slot.session.age_s(now_ns) or 0.0
+            oldest_s = age_s if oldest_s is None else max(oldest_s, age_s)
             if not self.coverage.has(slot.id):
                 causes.append(_of_unit(slot, "not_seen", "has not reported what it looks through"))
         if not len(self.registry):
@@ -271,16 +271,16 @@ class Master:
         _, robot_cause = self.robot.state(now_ns, self.settings.robot_stale_after_s)
         if robot_cause is not None:
             causes.append(robot_cause)
-        keys, witnesses = self.map.voxels()
+        keys, witnesses = self.map.voxels(live)
         return MapView(
             self.lattice,
             self.versions.lattice,
             keys,
             witnesses,
             tuple(cause.sentence for cause in causes),
-            max(ages_s, default=None),
-            len(ages_s),
-            self.map.reports(),
+            oldest_s,
+            len(live),
+            self.map.reports(live),
             tuple(causes),
         )
 
@@ -294,7 +294,7 @@ class Master:
 
     def next_change_ns(self, now_ns: int) -> int | None:
         """The time after which a unit or the robot is stale if it stays silent; the first of them, None without any."""
-        moments = [slot.expires_at_ns(self.settings.stale_after_s) for slot in self.registry]
+        moments = [slot.session.expires_at_ns(self.settings.stale_after_s) for slot in self.registry]
         moments.append(self.robot.expires_at_ns(self.settings.robot_stale_after_s))
         return min((moment for moment in moments if moment is not None and moment >= now_ns), default=None)
 
@@ -324,7 +324,7 @@ class Master:
 
     # ------------------------------------------------------------------ what an operator changes
 
-    def change_settings(self, changes: dict[str, Any]) -> Settings:
+    def change_settings(self, changes: Mapping[str, object]) -> Settings:
         """Change some settings; the others stay. Every unit has them with the answer to its next update.
 
         Raises:
@@ -338,7 +338,7 @@ class Master:
         if settings == self.settings:
             return settings
         lattice = self.cell.lattice(settings.voxel_size_m)
-        blocks = blocks_of(self.cell, settings.seen_block_size_m)
+        blocks = self.cell.blocks(settings.seen_block_size_m)
         lattice_changes = lattice != self.lattice
         versions = Versions(
             settings=self.versions.settings + 1,
@@ -365,7 +365,7 @@ class Master:
         """
         published = cell if isinstance(cell, PublishedCell) else PublishedCell.of(cell)
         lattice = published.cell.lattice(self.settings.voxel_size_m)
-        blocks = blocks_of(published.cell, self.settings.seen_block_size_m)
+        blocks = published.cell.blocks(self.settings.seen_block_size_m)
         if published.reference == self.published.reference:
             return self.cell_answer
         versions = self.versions.model_copy(
@@ -414,29 +414,17 @@ class Master:
         self.lattice_description = LatticeDescription.of(self.lattice)
         self.map = MergedMap(self.lattice)
         self.coverage = Coverage(blocks)
-        for slot in self.registry:
-            slot.keys = NO_KEYS
 
     def _withdraw(self, unit_id: int) -> None:
         self.map.withdraw(unit_id)
         self.coverage.withdraw(unit_id)
 
-    def _take_in(self, slot: Slot, update: UpdateRequest, keys: NDArray[np.uint32], now_ns: int) -> None:
-        slot.sequence = update.sequence
-        slot.arrived_at_ns = now_ns
-        slot.versions = update.versions
-        slot.health = update.health
-        slot.phase = update.phase
-        slot.keys = keys
-        if update.exchange is not None:
-            slot.clock.add(update.exchange)
-        if update.captured_at_ns != slot.captured_at_ns and update.captured_at_ns is not None:
-            slot.captures_ns.append(update.captured_at_ns)
-        slot.captured_at_ns = update.captured_at_ns
-        for ended in update.done:
-            slot.end(ended.id, ended.outcome)
+    def _notice(self, slot: Slot, now_ns: int) -> None:
         if slot.asked:
             slot.expire(now_ns)
+        state, cause = self.judge(slot, now_ns)
+        if state != slot.told_state:
+            slot.tell(state, cause)
 
     def _answer(self, slot: Slot, update: UpdateRequest, now_ns: int) -> UpdateAnswer:
         current, theirs = self._versions_for(slot), update.versions
@@ -449,7 +437,7 @@ class Master:
         )
         if current == theirs:
             return answer
-        changed: dict[str, Any] = {}
+        changed: dict[str, object] = {}
         if current.settings != theirs.settings or current.lattice != theirs.lattice:
             changed |= {"settings": self.settings, "lattice": self.lattice_description}
         if current.cell != theirs.cell:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The units' voxels merged into one map (Algorithm 9), at a cost of what changes."""
+"""The units' voxels, kept once, and merged into one map when somebody asks (Algorithm 9)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,68 +17,67 @@ MAX_WITNESSES = 255
 NO_KEYS: NDArray[np.uint32] = np.empty(0, dtype=np.uint32)
 
 
-class MergedMap:
-    """Which voxels of a lattice are reported, and by how many units.
+class _Merged(NamedTuple):
+    """The union of some units' reports, and of which; void once `revision` is another."""
 
-    A unit's report replaces its last one in time proportional to the two. The counter is as large as the lattice,
-    but only pages of it that were ever touched take memory.
+    revision: int
+    unit_ids: tuple[int, ...]
+    keys: NDArray[np.uint32]
+    witnesses: NDArray[np.uint8]
+
+
+class MergedMap:
+    """What each unit reported last on a lattice, and the union of any of these reports.
+
+    A report costs nothing until somebody asks for the union, which is kept for the next who asks for the same one.
     """
 
     def __init__(self, lattice: Lattice) -> None:
         self.lattice = lattice
         self.revision = 0
-        self._witnesses = np.zeros(lattice.cell_count, dtype=np.uint8)
         self._keys: dict[int, NDArray[np.uint32]] = {}
-        self._places: dict[int, NDArray[np.intp]] = {}
-        self._snapshot: tuple[NDArray[np.uint32], NDArray[np.uint8]] | None = None
-        self._reports: dict[int, NDArray[np.uint32]] | None = None
+        self._merged = _Merged(0, (), NO_KEYS, np.empty(0, np.uint8))
 
     def replace(self, unit_id: int, keys: NDArray[np.uint32]) -> None:
         """From now on the unit reports `keys` (N,): ascending, each once, below the lattice's cell count."""
-        if self._keys.get(unit_id) is keys:
-            return
-        before = self._places.get(unit_id)
-        if before is not None:
-            self._witnesses[before] -= 1
-        # As numpy's own kind of index, which it would otherwise make of them twice at each use.
-        places = keys.astype(np.intp)
-        self._witnesses[places] += 1
-        self._keys[unit_id], self._places[unit_id] = keys, places
-        self._changed()
+        if self._keys.get(unit_id) is not keys:
+            self._keys[unit_id] = keys
+            self.revision += 1
 
     def withdraw(self, unit_id: int) -> None:
         """From now on the unit reports nothing; harmless when it did not."""
         if self._keys.pop(unit_id, None) is not None:
-            self._witnesses[self._places.pop(unit_id)] -= 1
-            self._changed()
+            self.revision += 1
 
-    def voxels(self) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
-        """The keys (M,) uint32 of all voxels reported, ascending, and their witnesses (M,) uint8."""
-        if self._snapshot is None:
-            keys = _union(list(self._keys.values()))
-            self._snapshot = keys, self._witnesses[keys]
-        return self._snapshot
+    def keys_of(self, unit_id: int) -> NDArray[np.uint32]:
+        """What the unit reported last (N,); empty when it reports nothing."""
+        return self._keys.get(unit_id, NO_KEYS)
 
-    def reports(self) -> Mapping[int, NDArray[np.uint32]]:
-        """What each unit reports, by its id."""
-        if self._reports is None:
-            self._reports = dict(self._keys)
-        return self._reports
+    def voxels(self, unit_ids: Iterable[int] | None = None) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
+        """The keys (M,) uint32 that these units report, ascending, and how many of them report each (M,) uint8.
 
-    def _changed(self) -> None:
-        self.revision += 1
-        self._snapshot = None
-        self._reports = None
+        Without `unit_ids`, those of all units.
+        """
+        ids = tuple(self._keys if unit_ids is None else unit_ids)
+        if (self._merged.revision, self._merged.unit_ids) != (self.revision, ids):
+            self._merged = _Merged(self.revision, ids, *_union([self.keys_of(unit_id) for unit_id in ids]))
+        return self._merged.keys, self._merged.witnesses
+
+    def reports(self, unit_ids: Iterable[int] | None = None) -> Mapping[int, NDArray[np.uint32]]:
+        """What each of these units reports, by its id; without `unit_ids`, what all do."""
+        return {unit_id: self.keys_of(unit_id) for unit_id in (self._keys if unit_ids is None else unit_ids)}
 
 
-def _union(reports: list[NDArray[np.uint32]]) -> NDArray[np.uint32]:
-    """All keys, ascending, each once.
+def _union(reports: list[NDArray[np.uint32]]) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
+    """All keys, ascending, each once, and how often each is reported.
 
-    Sorted by hand: numpy.unique takes them through a hash table, which costs eight times as much, and looking through
-    the counter would cost more the finer the lattice is, however little stands in it.
+    Sorted by hand: numpy.unique takes them through a hash table, which costs eight times as much. Counted in what was
+    sorted: a counter as large as the lattice had to be kept right with each report, at more than the report itself.
     """
     keys = np.concatenate(reports or [NO_KEYS])
     keys.sort()
-    first = np.ones(len(keys), np.bool_)
-    np.not_equal(keys[1:], keys[:-1], out=first[1:])
-    return keys[first]
+    # One more than there are keys: where the last one ends.
+    first = np.ones(len(keys) + 1, np.bool_)
+    np.not_equal(keys[1:], keys[:-1], out=first[1:-1])
+    begins = np.flatnonzero(first)
+    return keys[begins[:-1]], np.diff(begins).astype(np.uint8)

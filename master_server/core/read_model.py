@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from master_server.core.master import MapView
+from master_server.core.units import UnitState
 from shared.lattice import Lattice
 from shared.messages import CellReference, RobotAnswer, UnitRow
 from shared.settings import Settings
@@ -47,7 +48,7 @@ class Readable(Protocol):
 
     def units(self, now_ns: int) -> list[UnitRow]: ...
 
-    def unit_states(self, now_ns: int) -> list[dict[str, Any]]: ...
+    def unit_states(self, now_ns: int) -> list[UnitState]: ...
 
     def robot_answer(self, since_ns: int | None, now_ns: int) -> RobotAnswer: ...
 

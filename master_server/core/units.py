@@ -9,11 +9,12 @@ import secrets
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
 
-from master_server.core.merged_map import MAX_WITNESSES, NO_KEYS
+from master_server.core.merged_map import MAX_WITNESSES
 from master_server.persistence import Store, UnitRecord
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.errors import Refusal
@@ -33,6 +34,7 @@ from shared.messages import (
     ReasonCode,
     State,
     UnitRow,
+    UpdateRequest,
     Verb,
     Versions,
 )
@@ -78,6 +80,22 @@ IMAGE_EXPIRES_S = 5.0
 """The unit needs one frame and one update for it; whoever waits in front of a browser has lost patience by then."""
 
 
+@dataclass(frozen=True)
+class UnitState:
+    """One unit in a message of the stream."""
+
+    # Readers pass over what a later master tells besides, also within a message that forbids it.
+    __pydantic_config__ = ConfigDict(extra="ignore")
+
+    id: int
+    ip: str
+    state: State
+    reason: str
+    cause: Annotated[Reason | None, Field(description="The reason for programs.")]
+    age_s: Annotated[float | None, Field(description="Since the capture of its last frame.")]
+    voxels: int
+
+
 @dataclass
 class _Asked:
     """A command that the unit has not answered yet."""
@@ -86,25 +104,85 @@ class _Asked:
     expires_at_ns: int
     on_end: Callable[[Outcome], None] | None = None
 
+    @property
+    def unanswered(self) -> Outcome:
+        """What becomes of it when the unit does not answer in time."""
+        limit_s = IMAGE_EXPIRES_S if self.command.verb == "image" else COMMAND_EXPIRES_S
+        return Outcome("unanswered", f"the unit did not answer within {limit_s:g} s")
+
 
 @dataclass
-class Slot:
-    """What the master knows of the one camera behind an IP. Times of the unit are by the unit's clock."""
+class Session:
+    """What a unit said since it registered. Times of the unit are by the unit's clock."""
 
-    record: UnitRecord
-    session: int = field(default_factory=lambda: secrets.randbits(32))
+    told_pose: Matrix | None = None
     registered: bool = False
+    phase: Phase = "registering"
+    versions: Versions = field(default_factory=Versions)
+    # Random, so that a session of a master before this one is never mistaken for a current one.
+    number: int = field(default_factory=lambda: secrets.randbits(32))
     sequence: int = -1
     clock: ClockOffset = field(default_factory=ClockOffset)
     arrived_at_ns: int | None = None
     captured_at_ns: int | None = None
     captures_ns: deque[int] = field(default_factory=lambda: deque(maxlen=FPS_FRAMES))
-    versions: Versions = field(default_factory=Versions)
-    keys: NDArray[np.uint32] = field(default_factory=lambda: NO_KEYS)
     health: Health = field(default_factory=Health)
-    phase: Phase = "registering"
     contract_minor: int | None = None
-    told_pose: Matrix | None = None
+
+    def take_in(self, update: UpdateRequest, now_ns: int) -> None:
+        """The unit's newest update, which arrived at `now_ns`."""
+        self.sequence = update.sequence
+        self.arrived_at_ns = now_ns
+        self.versions = update.versions
+        self.health = update.health
+        self.phase = update.phase
+        if update.exchange is not None:
+            self.clock.add(update.exchange)
+        if update.captured_at_ns != self.captured_at_ns and update.captured_at_ns is not None:
+            self.captures_ns.append(update.captured_at_ns)
+        self.captured_at_ns = update.captured_at_ns
+
+    def age_s(self, now_ns: int) -> float | None:
+        """Seconds from the last frame's capture to the master's `now_ns`; None while it cannot be told."""
+        if self.captured_at_ns is None or not self.clock.known:
+            return None
+        return (now_ns - self.captured_at_ns - self.clock.offset_ns) / NS_PER_S
+
+    def arrival_age_s(self, now_ns: int) -> float | None:
+        """Seconds since an update arrived."""
+        return None if self.arrived_at_ns is None else (now_ns - self.arrived_at_ns) / NS_PER_S
+
+    def is_silent(self, now_ns: int, after_s: float) -> bool:
+        """Whether no update came for `after_s`."""
+        arrival_age_s = self.arrival_age_s(now_ns)
+        return arrival_age_s is None or arrival_age_s > after_s
+
+    def expires_at_ns(self, stale_after_s: float) -> int | None:
+        """When, by the master's clock, its last view becomes too old; None while it has none."""
+        if self.arrived_at_ns is None or self.captured_at_ns is None or not self.clock.known:
+            return None
+        newest_ns = min(self.arrived_at_ns, self.captured_at_ns + self.clock.offset_ns)
+        return newest_ns + round(stale_after_s * NS_PER_S)
+
+    def clock_uncertainty_ns(self, now_ns: int) -> int | None:
+        """How far `age_s` may be off."""
+        return self.clock.uncertainty_ns(now_ns - self.clock.offset_ns) if self.clock.known else None
+
+    @property
+    def fps(self) -> float:
+        """Frames a second, over the last few."""
+        captures = self.captures_ns
+        if len(captures) < 2 or captures[-1] <= captures[0]:
+            return 0.0
+        return (len(captures) - 1) * NS_PER_S / (captures[-1] - captures[0])
+
+
+@dataclass
+class Slot:
+    """What the master knows of the one camera behind an IP, but for what it reports: `MergedMap` and `Coverage`."""
+
+    record: UnitRecord
+    session: Session = field(default_factory=Session)
     warning: str = ""
     asked: deque[_Asked] = field(default_factory=deque)
     last_command: CommandRow | None = None
@@ -121,40 +199,28 @@ class Slot:
         self.become(self.record)
 
     def become(self, record: UnitRecord) -> None:
-        """What is kept of it is this from now on; with another pose, what it reported is void."""
-        if record.pose_version != self.record.pose_version:
-            self.keys = NO_KEYS
+        """What is kept of it is this from now on."""
         self.record = record
         # Each update asks for these.
         self.id, self.ip = record.id, record.ip
         self.T_world_camera, self.pose_version = record.T_world_camera, record.pose_version
-        self.warning = _pose_warning(record, self.told_pose)
+        self.warning = _pose_warning(record, self.session.told_pose)
 
     def begin_session(self, told_pose: Matrix | None, contract_minor: int | None = None) -> None:
         """The unit registered; whatever it said before is void."""
-        # Random, so that a session of a master before this one is never mistaken for a current one.
-        self.session = secrets.randbits(32)
-        self.registered = True
-        self.sequence = -1
-        self.clock = ClockOffset()
-        self.arrived_at_ns = self.captured_at_ns = None
-        self.captures_ns.clear()
-        self.keys = NO_KEYS
-        self.health = Health()
-        self.phase = "fetching"
-        self.told_pose = told_pose
-        self.contract_minor = contract_minor
+        self.session = Session(
+            told_pose,
+            registered=True,
+            phase="fetching",
+            versions=self.session.versions,
+            contract_minor=contract_minor,
+        )
         self.warning = _pose_warning(self.record, told_pose)
 
     @property
     def serial(self) -> str:
         """Serial number of the camera."""
         return self.record.serial
-
-    def is_silent(self, now_ns: int, after_s: float) -> bool:
-        """Whether no update came for `after_s`."""
-        arrival_age_s = self.arrival_age_s(now_ns)
-        return arrival_age_s is None or arrival_age_s > after_s
 
     @property
     def commands(self) -> tuple[Command, ...]:
@@ -163,9 +229,8 @@ class Slot:
 
     def expire(self, now_ns: int) -> None:
         """Give up what the unit did not answer in its time."""
-        for asked in [asked for asked in self.asked if asked.expires_at_ns <= now_ns]:
-            limit_s = IMAGE_EXPIRES_S if asked.command.verb == "image" else COMMAND_EXPIRES_S
-            self.end(asked.command.id, Outcome("unanswered", f"the unit did not answer within {limit_s:g} s"))
+        for asked in self._overdue(now_ns):
+            self.end(asked.command.id, asked.unanswered)
 
     def end(self, command_id: int, outcome: Outcome) -> None:
         """A command came to an end; harmless when it had before."""
@@ -191,23 +256,6 @@ class Slot:
             if self.last_command is not None and self.last_command.id == command_id:
                 self.last_command = self.last_command.ended(outcome)
 
-    def age_s(self, now_ns: int) -> float | None:
-        """Seconds from the last frame's capture to the master's `now_ns`; None while it cannot be told."""
-        if self.captured_at_ns is None or not self.clock.known:
-            return None
-        return (now_ns - self.captured_at_ns - self.clock.offset_ns) / NS_PER_S
-
-    def arrival_age_s(self, now_ns: int) -> float | None:
-        """Seconds since an update arrived."""
-        return None if self.arrived_at_ns is None else (now_ns - self.arrived_at_ns) / NS_PER_S
-
-    def expires_at_ns(self, stale_after_s: float) -> int | None:
-        """When, by the master's clock, its last view becomes too old; None while it has none."""
-        if self.arrived_at_ns is None or self.captured_at_ns is None or not self.clock.known:
-            return None
-        newest_ns = min(self.arrived_at_ns, self.captured_at_ns + self.clock.offset_ns)
-        return newest_ns + round(stale_after_s * NS_PER_S)
-
     def tell(self, state: State, cause: Reason | None) -> None:
         """Log that its state is another one."""
         reason = sentence_of(cause)
@@ -222,18 +270,6 @@ class Slot:
         """What a line of the log about it carries besides its text."""
         return {"event": event, "unit_id": self.id, "ip": self.ip}
 
-    def clock_uncertainty_ns(self, now_ns: int) -> int | None:
-        """How far `age_s` may be off."""
-        return self.clock.uncertainty_ns(now_ns - self.clock.offset_ns) if self.clock.known else None
-
-    @property
-    def fps(self) -> float:
-        """Frames a second, over the last few."""
-        captures = self.captures_ns
-        if len(captures) < 2 or captures[-1] <= captures[0]:
-            return 0.0
-        return (len(captures) - 1) * NS_PER_S / (captures[-1] - captures[0])
-
     def judge(self, now_ns: int, current: Versions, settings: Settings) -> tuple[State, Reason | None]:
         """The unit's state, and the reason when it is not live, or a warning when it is.
 
@@ -243,7 +279,7 @@ class Slot:
             return "uncalibrated", self._without_pose()
         if stale := self._stale(now_ns, current, settings):
             return "stale", self._with_trouble(stale)
-        health = self.health
+        health = self.session.health
         if health.trouble:
             return "blind", self._trouble(health.trouble)
         if health.blind:
@@ -263,11 +299,11 @@ class Slot:
             return "live", Reason("pose_differs", text)
         return "live", Reason("warning", health.warning) if health.warning else None
 
-    def row(self, now_ns: int, state: State, cause: Reason | None, range_m: float | None) -> UnitRow:
+    def row(self, now_ns: int, state: State, cause: Reason | None, voxels: int, range_m: float | None) -> UnitRow:
         """What `GET /units` tells."""
-        self.expire(now_ns)
-        age_s, arrival_age_s = self.age_s(now_ns), self.arrival_age_s(now_ns)
-        uncertainty_ns = self.clock_uncertainty_ns(now_ns)
+        session = self.session
+        age_s, arrival_age_s = session.age_s(now_ns), session.arrival_age_s(now_ns)
+        uncertainty_ns = session.clock_uncertainty_ns(now_ns)
         return UnitRow(
             id=self.id,
             ip=self.ip,
@@ -277,60 +313,72 @@ class Slot:
             state=state,
             reason=sentence_of(cause),
             cause=cause,
-            phase=self.phase,
+            phase=session.phase,
             age_s=None if age_s is None else round(age_s, 4),
             arrival_age_s=None if arrival_age_s is None else round(arrival_age_s, 4),
             clock_uncertainty_ms=None if uncertainty_ns is None else round(uncertainty_ns / NS_PER_MS, 3),
-            fps=round(self.fps, 2),
-            voxels=len(self.keys),
-            process_ms=self.health.process_ms,
-            frame_number=self.health.frame,
-            health=self.health,
+            fps=round(session.fps, 2),
+            voxels=voxels,
+            process_ms=session.health.process_ms,
+            frame_number=session.health.frame,
+            health=session.health,
             T_world_camera=self.T_world_camera,
             pose_origin=self.record.pose_origin,
             pose_quality=self.record.pose_quality,
             intrinsics=self.record.intrinsics,
             range_m=range_m,
-            versions=self.versions,
-            contract_minor=self.contract_minor,
-            last_command=self.last_command,
+            versions=session.versions,
+            contract_minor=session.contract_minor,
+            last_command=self._last_command(now_ns),
         )
+
+    def _last_command(self, now_ns: int) -> CommandRow | None:
+        """The last command, with what became of it by `now_ns`, whether or not that was noticed yet."""
+        last = self.last_command
+        for asked in self._overdue(now_ns):
+            if last is not None and last.id == asked.command.id:
+                return last.ended(asked.unanswered)
+        return last
+
+    def _overdue(self, now_ns: int) -> list[_Asked]:
+        return [asked for asked in self.asked if asked.expires_at_ns <= now_ns]
 
     def _without_pose(self) -> Reason:
         """Why it is not known where its camera is."""
         if self.record.note:
-            is_old = self.health.trouble_code == "contract"
+            is_old = self.session.health.trouble_code == "contract"
             return Reason("contract" if is_old else "pose_void", self.record.note)
-        if self.health.trouble:
-            return self._trouble(self.health.trouble)
+        if self.session.health.trouble:
+            return self._trouble(self.session.health.trouble)
         return Reason("no_pose", "its pose is not known yet")
 
     def _trouble(self, sentence: str) -> Reason:
         """What the unit says is wrong, and how far it is with what is to be waited for."""
-        progress = self.health.progress
+        progress = self.session.health.progress
         numbers = {"done": float(progress.done), "total": float(progress.total)} if progress else {}
-        return Reason(self.health.trouble_code or "trouble", sentence, numbers)
+        return Reason(self.session.health.trouble_code or "trouble", sentence, numbers)
 
     def _with_trouble(self, stale: Reason) -> Reason:
         """The same with what the unit said was wrong; one that does not understand its master is not merely late."""
-        trouble = self.health.trouble
+        trouble = self.session.health.trouble
         if not trouble:
             return stale
-        is_old = self.health.trouble_code == "contract" and stale.code not in SILENT
+        is_old = self.session.health.trouble_code == "contract" and stale.code not in SILENT
         return Reason("contract" if is_old else stale.code, f"{stale.sentence} ({trouble})", stale.numbers)
 
     def _stale(self, now_ns: int, current: Versions, settings: Settings) -> Reason | None:
         """Why its last view says nothing about now; None when it does."""
         limit_s = settings.stale_after_s
-        arrival_age_s, age_s = self.arrival_age_s(now_ns), self.age_s(now_ns)
-        uncertainty_ns = self.clock_uncertainty_ns(now_ns)
+        session = self.session
+        arrival_age_s, age_s = session.arrival_age_s(now_ns), session.age_s(now_ns)
+        uncertainty_ns = session.clock_uncertainty_ns(now_ns)
         if arrival_age_s is None:
-            since = "it registered" if self.registered else "the master started"
+            since = "it registered" if session.registered else "the master started"
             return Reason("no_update", f"no update since {since}")
         if arrival_age_s > limit_s:
             text = f"its last update came {arrival_age_s:.1f} s ago, at most {limit_s:g} s are trusted"
             return Reason("late_update", text, {"age_s": round(arrival_age_s, 1), "limit_s": limit_s})
-        if self.captured_at_ns is None:
+        if session.captured_at_ns is None:
             return Reason("no_frame", "no frame yet")
         if age_s is None or uncertainty_ns is None:
             return Reason("clock_unknown", "its clock is not known yet")
@@ -344,15 +392,15 @@ class Slot:
         if age_s * NS_PER_S < -(uncertainty_ns + FUTURE_TOLERANCE_NS):
             text = f"its last frame seems to be of {-age_s:.3f} s from now: its clock jumped"
             return Reason("clock_jumped", text, {"ahead_s": round(-age_s, 3)})
-        if self.versions.lattice != current.lattice:
+        if session.versions.lattice != current.lattice:
             text = "it does not work on the current lattice yet"
-            return _behind("old_lattice", text, self.versions.lattice, current.lattice)
-        if self.versions.cell != current.cell:
+            return _behind("old_lattice", text, session.versions.lattice, current.lattice)
+        if session.versions.cell != current.cell:
             text = "it does not work with the current cell yet"
-            return _behind("old_cell", text, self.versions.cell, current.cell)
-        if self.versions.pose != self.pose_version:
+            return _behind("old_cell", text, session.versions.cell, current.cell)
+        if session.versions.pose != self.pose_version:
             text = "it does not work with its current pose yet"
-            return _behind("old_pose", text, self.versions.pose, self.pose_version)
+            return _behind("old_pose", text, session.versions.pose, self.pose_version)
         return None
 
 
@@ -391,10 +439,10 @@ class Registry:
         """
         elsewhere = [slot for slot in self if slot.serial == request.serial and slot.ip != ip]
         for old in elsewhere:
-            if not old.is_silent(now_ns, stale_after_s):
+            if not old.session.is_silent(now_ns, stale_after_s):
                 raise Refusal(409, f"camera {request.serial} reports from IP {old.ip} (unit {old.id}) at this moment")
         slot = self._by_ip.get(ip)
-        if slot is not None and slot.serial != request.serial and not slot.is_silent(now_ns, stale_after_s):
+        if slot is not None and slot.serial != request.serial and not slot.session.is_silent(now_ns, stale_after_s):
             raise Refusal(
                 409,
                 f"camera {request.serial}: camera {slot.serial} reports from IP {ip} (unit {slot.id}) at this moment; "

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from master_server.core import MapView
+from master_server.core import MapView, UnitState
 from master_server.recording.recording_reader import Frame
 from master_server.recording.timeline import Timeline, duration_s
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
@@ -22,8 +22,6 @@ from shared.settings import Settings
 
 SPEED_MIN, SPEED_MAX = 0.01, 100.0
 """From where the robot's single steps are seen to where a shift passes in five minutes."""
-
-STREAMED = {"id", "ip", "state", "reason", "cause", "age_s", "voxels"}
 
 LOOK_PERIOD_NS = 10 * NS_PER_MS
 """Listeners are woken at most this often, however fast it plays."""
@@ -106,9 +104,12 @@ class Replay:
         """One row a unit."""
         return list(self._frame(now_ns).state.units)
 
-    def unit_states(self, now_ns: int) -> list[dict[str, Any]]:
+    def unit_states(self, now_ns: int) -> list[UnitState]:
         """Of each row what a stream tells."""
-        return [row.model_dump(include=STREAMED) for row in self.units(now_ns)]
+        return [
+            UnitState(row.id, row.ip, row.state, row.reason, row.cause, row.age_s, row.voxels)
+            for row in self.units(now_ns)
+        ]
 
     def robot_answer(self, since_ns: int | None, now_ns: int) -> RobotAnswer:
         """The newest joints, or all after `since_ns`, by the clock of the recording."""

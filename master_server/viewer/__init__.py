@@ -6,7 +6,8 @@ does any more; that process listens on loopback only, has none of the master's t
 master alone. In the order of the flow:
 
     sessions   who may look, and who may change something: links that work once, and cookies
-    channel    requests and answers between the master and that process
+    messages   what the master and that process say to each other
+    channel    the same as bytes
     snapshot   what one look at the master tells
     host       that process, started and served by the master
     proxy      the page and its socket as HTTP

@@ -13,11 +13,18 @@ import struct
 import threading
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as TookTooLong
-from typing import Any
+from typing import TypeVar
 
 import msgpack
+from pydantic import TypeAdapter, ValidationError
 
-from shared.errors import WireError
+from master_server.viewer.messages import RefusedAnswer, Request, ViewerMessage
+from shared.configuration import sentence
+from shared.errors import Refusal, WireError
+
+Answer = TypeVar("Answer", bound=ViewerMessage)
+
+REQUESTS: TypeAdapter[Request] = TypeAdapter(Request)
 
 LENGTH = struct.Struct("<I")
 
@@ -28,9 +35,9 @@ CONVERSATION_S = 15.0
 """An answer that took longer is of no use to anyone in front of a window; a picture takes up to 5 s."""
 
 
-def pack(message: dict[str, Any]) -> bytes:
-    """A message as it travels."""
-    data: bytes = msgpack.packb(message)
+def pack(number: int, message: ViewerMessage) -> bytes:
+    """A request, or the answer to the request of this number, as it travels."""
+    data: bytes = msgpack.packb((number, message.model_dump()))
     return LENGTH.pack(len(data)) + data
 
 
@@ -41,17 +48,25 @@ def _length(head: bytes) -> int:
     return int(length)
 
 
-async def receive(reader: asyncio.StreamReader) -> dict[str, Any] | None:
-    """The next message; None at the end.
+async def receive(reader: asyncio.StreamReader) -> tuple[int, Request] | None:
+    """The next request and its number; None at the end.
 
     Raises:
-        WireError: it is absurdly long.
+        WireError: it is absurdly long, or none that the viewer makes.
     """
     try:
         length = _length(await reader.readexactly(LENGTH.size))
-        return dict(msgpack.unpackb(await reader.readexactly(length), strict_map_key=False))
+        number, fields = _unpacked(await reader.readexactly(length))
+        return number, REQUESTS.validate_python(fields)
     except (asyncio.IncompleteReadError, ConnectionError):
         return None
+    except ValidationError as error:
+        raise WireError(f"viewer: {sentence(error)}") from error
+
+
+def _unpacked(data: bytes) -> tuple[int, object]:
+    number, fields = msgpack.unpackb(data, strict_map_key=False)
+    return int(number), fields
 
 
 class Asker:
@@ -60,22 +75,23 @@ class Asker:
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection
         self._sending = threading.Lock()
-        self._waiting: dict[int, Future[dict[str, Any]]] = {}
+        self._waiting: dict[int, Future[object]] = {}
         self._numbers = itertools.count()
 
-    def ask(self, **question: Any) -> dict[str, Any]:
-        """The master's answer.
+    def ask(self, request: ViewerMessage, kind: type[Answer]) -> Answer:
+        """The master's answer, which is of this kind.
 
         Raises:
+            Refusal: 500, the master refuses, or answers something else.
             WireError: there was none within `CONVERSATION_S`, or the master is gone.
         """
         number = next(self._numbers)
-        answer: Future[dict[str, Any]] = Future()
+        answer: Future[object] = Future()
         self._waiting[number] = answer
         try:
             with self._sending:
-                self._connection.sendall(pack({"id": number, **question}))
-            return answer.result(CONVERSATION_S)
+                self._connection.sendall(pack(number, request))
+            return _answer_of(answer.result(CONVERSATION_S), kind)
         except TookTooLong as error:
             raise WireError(f"the master did not answer within {CONVERSATION_S:g} s") from error
         except OSError as error:
@@ -86,14 +102,15 @@ class Asker:
     def listen(self) -> None:
         """Hand out answers until the master is gone."""
         while (message := self._receive()) is not None:
-            waiting = self._waiting.get(message["id"])
+            number, fields = message
+            waiting = self._waiting.get(number)
             if waiting is not None and not waiting.done():
-                waiting.set_result(message)
+                waiting.set_result(fields)
 
-    def _receive(self) -> dict[str, Any] | None:
+    def _receive(self) -> tuple[int, object] | None:
         head = self._read(LENGTH.size)
         data = None if head is None else self._read(_length(head))
-        return None if data is None else dict(msgpack.unpackb(data, strict_map_key=False))
+        return None if data is None else _unpacked(data)
 
     def _read(self, count: int) -> bytes | None:
         data = bytearray()
@@ -106,3 +123,12 @@ class Asker:
                 return None
             data += piece
         return bytes(data)
+
+
+def _answer_of(fields: object, kind: type[Answer]) -> Answer:
+    if isinstance(fields, dict) and "refused" in fields:
+        raise Refusal(500, RefusedAnswer.model_validate(fields).refused)
+    try:
+        return kind.model_validate(fields)
+    except ValidationError as error:
+        raise Refusal(500, f"viewer: the master's answer is no {kind.__name__}: {sentence(error)}") from error

@@ -13,8 +13,8 @@ import os
 import secrets
 import socket
 import sys
+from collections.abc import Coroutine
 from importlib.util import find_spec
-from typing import Any
 
 import httpx
 from starlette.types import ASGIApp
@@ -24,8 +24,20 @@ from master_server.core import Readable
 from master_server.recording.replay import Replay
 from master_server.security import Access
 from master_server.viewer.channel import pack, receive
+from master_server.viewer.messages import (
+    ApiAnswer,
+    ApiRequest,
+    BeginAnswer,
+    BeginRequest,
+    LookRequest,
+    ReadyAnswer,
+    ReadyRequest,
+    RefusedAnswer,
+    Request,
+    ViewerMessage,
+)
 from master_server.viewer.sessions import Viewer
-from master_server.viewer.snapshot import Wanted, look
+from master_server.viewer.snapshot import look
 from shared.clock import monotonic_ns
 from shared.errors import Refusal, WireError
 from shared.waiting import within
@@ -129,22 +141,12 @@ class ViewerHost:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
-            while (message := await receive(reader)) is not None:
-                verb = message["verb"]
-                if verb == "look":
-                    answer = self._look(message)
-                elif verb == "ask" and len(self._asks) < ASKS_MAX:
-                    self._begin(self._ask(message, writer))
+            while (asked := await receive(reader)) is not None:
+                number, request = asked
+                if isinstance(request, ApiRequest) and len(self._asks) < ASKS_MAX:
+                    self._begin(self._ask(number, request, writer))
                     continue
-                elif verb == "begin":
-                    answer = {"key": self.key, "actions": self._actions, "is_replay": isinstance(self._master, Replay)}
-                elif verb == "ready":
-                    self.port = int(message["port"])
-                    self._ready.set()
-                    answer = {}
-                else:
-                    answer = {"status": 429, "body": b'{"detail": "too much is asked at once"}'}
-                writer.write(pack({"id": message["id"], **answer}))
+                writer.write(pack(number, self._answer(request)))
                 await writer.drain()
         except (WireError, ConnectionError) as error:
             logger.warning("viewer: %s", error)
@@ -153,35 +155,43 @@ class ViewerHost:
             self._ready.clear()
             self._serving = None
 
-    def _look(self, message: dict[str, Any]) -> dict[str, Any]:
-        try:
-            return look(self._master, self._history, Wanted(**message["wanted"]), monotonic_ns())
-        except Refusal as refusal:
-            # A recording may be damaged in its middle.
-            return {"refused": str(refusal)}
+    def _answer(self, request: Request) -> ViewerMessage:
+        """What can be told at once."""
+        if isinstance(request, LookRequest):
+            try:
+                return look(self._master, self._history, request, monotonic_ns())
+            except Refusal as refusal:
+                # A recording may be damaged in its middle.
+                return RefusedAnswer(refused=str(refusal))
+        if isinstance(request, BeginRequest):
+            return BeginAnswer(key=self.key, actions=self._actions, is_replay=isinstance(self._master, Replay))
+        if isinstance(request, ReadyRequest):
+            self.port = request.port
+            self._ready.set()
+            return ReadyAnswer()
+        return ApiAnswer(status=429, body=b'{"detail": "too much is asked at once"}')
 
-    def _begin(self, work: Any) -> None:
+    def _begin(self, work: Coroutine[None, None, None]) -> None:
         task = asyncio.ensure_future(work)
         self._asks.add(task)
         task.add_done_callback(self._asks.discard)
 
-    async def _ask(self, message: dict[str, Any], writer: asyncio.StreamWriter) -> None:
+    async def _ask(self, number: int, request: ApiRequest, writer: asyncio.StreamWriter) -> None:
         """Answer by the same API that anyone may ask, as the person who looks may ask it."""
-        method = message["method"]
-        if method != "GET" and message["viewer"] != Viewer.OPERATOR.value:
+        if request.method != "GET" and request.viewer is not Viewer.OPERATOR:
             status, body = 403, b'{"detail": "this needs the token of the operator"}'
         else:
             # Without the way through sockets and TLS.
             async with httpx.AsyncClient(transport=httpx.ASGITransport(self._app), base_url=LOCAL) as client:
                 response = await client.request(
-                    method,
-                    message["path"],
-                    json=message["body"],
+                    request.method,
+                    request.path,
+                    json=request.body,
                     headers={"Authorization": f"Bearer {self._access.operator_token.decode()}"},
                 )
             status, body = response.status_code, response.content
         try:
-            writer.write(pack({"id": message["id"], "status": status, "body": body}))
+            writer.write(pack(number, ApiAnswer(status=status, body=body)))
             await writer.drain()
         except ConnectionError:
             logger.debug("viewer: it is gone before it was answered")

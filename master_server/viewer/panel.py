@@ -7,7 +7,7 @@ import html
 import io
 import json
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 from urllib.parse import quote
@@ -19,7 +19,9 @@ import viser
 from numpy.typing import NDArray
 
 from master_server.api.history import SAMPLES_MAX, Sample
+from master_server.recording.replay import ReplayAnswer
 from master_server.viewer.channel import Asker
+from master_server.viewer.messages import ApiAnswer, ApiRequest, Look
 from master_server.viewer.scene import (
     SHARED_COLOUR,
     STATE_COLOURS,
@@ -34,7 +36,8 @@ from master_server.viewer.scene import (
 from master_server.viewer.sessions import Viewer
 from shared.clock import NS_PER_S
 from shared.errors import CellwatchError, Refusal
-from shared.lattice import Lattice
+from shared.messages import Progress, UnitRow
+from shared.settings import Settings
 
 ACTION_S = 5.0
 """For what an operator's own action posts to."""
@@ -89,73 +92,74 @@ COLOURINGS = BY_WITNESSES, BY_UNIT = "number of units", "unit"
 """What the colours of voxels may tell."""
 
 
-def status_html(told: dict[str, Any]) -> str:
+def status_html(told: Look) -> str:
     """Whether the map is all there is, and why not."""
-    replayed = told.get("replay")
+    replayed = told.replay
     lines = []
     if replayed:
-        state = "playing" if replayed["playing"] else "paused"
+        state = "playing" if replayed.playing else "paused"
         lines.append(
-            f"<b>recording</b> {html.escape(replayed['file'])}, {replayed['position_s']:.1f} of "
-            f"{replayed['duration_s']:.1f} s{_of_files(replayed['files'])}, {state}"
+            f"<b>recording</b> {html.escape(replayed.file)}, {replayed.position_s:.1f} of "
+            f"{replayed.duration_s:.1f} s{_of_files(replayed.files)}, {state}"
         )
-    voxels = len(told["keys"]) // 4
-    age_s = told["oldest_view_age_s"]
+    voxels = told.map.count
+    age_s = told.oldest_view_age_s
     age = "" if age_s is None else f", oldest view {age_s * 1000:.0f} ms"
-    units = f"{told['units_live']} unit{'' if told['units_live'] == 1 else 's'} live"
+    units = f"{told.units_live} unit{'' if told.units_live == 1 else 's'} live"
     lines.append(f"<b>{voxels}</b> obstacle voxels, {units}{age}")
-    if told["reasons"]:
+    if told.reasons:
         colour = _css("blind")
         lines.append(f'<b style="color:{colour}">The map is not complete:</b>')
-        lines += [html.escape(reason) for reason in told["reasons"]]
-        more = told["reason_count"] - len(told["reasons"])
+        lines += [html.escape(reason) for reason in told.reasons]
+        more = told.reason_count - len(told.reasons)
         lines += [f"and {more} more"] * (more > 0)
     else:
         lines.append(f'<b style="color:{_css("live")}">The map is complete.</b>')
-    if told["robot"]["state"] not in ("fresh", "none"):
-        lines.append(f"robot: {html.escape(told['robot']['reason'])}")
+    if told.robot.state not in ("fresh", "none"):
+        lines.append(f"robot: {html.escape(told.robot.reason)}")
     return f'{STYLE}<div class="cw" data-cellwatch="status">{"<br>".join(lines)}</div>'
 
 
-def table_html(rows: list[dict[str, Any]]) -> str:
+def table_html(rows: Sequence[UnitRow]) -> str:
     """A row a unit, and below it why it is not live."""
     heads = ("unit", "state", "age ms", "fps", "ms", "voxels", "valid", "fits")
     parts = [f"<tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr>"]
     for row in rows:
-        health = row["health"]
-        state = row["state"]
+        health = row.health
+        state = row.state
         cells = (
-            f"{row['id']} · {html.escape(row['ip'])}",
+            f"{row.id} · {html.escape(row.ip)}",
             f'<span style="color:{_css(state)}">⬤</span> <b>{state}</b>',
-            "" if row["age_s"] is None else f"{row['age_s'] * 1000:.0f}",
-            f"{row['fps']:.1f}",
-            f"{row['process_ms']:.1f}",
-            str(row["voxels"]),
-            f"{health['valid_share']:.0%}",
-            f"{health['agreeing_share']:.0%}" if health["static_share"] > 0.0 else "",
+            "" if row.age_s is None else f"{row.age_s * 1000:.0f}",
+            f"{row.fps:.1f}",
+            f"{row.process_ms:.1f}",
+            str(row.voxels),
+            f"{health.valid_share:.0%}",
+            f"{health.agreeing_share:.0%}" if health.static_share > 0.0 else "",
         )
-        data = f'data-unit="{row["id"]}" data-state="{state}"'
+        data = f'data-unit="{row.id}" data-state="{state}"'
         parts.append(f"<tr {data}>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
-        notes = [row["reason"]] if row["reason"] else []
-        if command := row["last_command"]:
-            detail = f": {command['detail']}" if command["code"] == "done" and command["detail"] else ""
-            notes.append(f"{command['verb']}: {command['outcome'] or 'under way'}{detail}")
+        notes = [row.reason] if row.reason else []
+        if command := row.last_command:
+            detail = f": {command.detail}" if command.code == "done" and command.detail else ""
+            notes.append(f"{command.verb}: {command.outcome or 'under way'}{detail}")
         if notes:
-            bar = _progress_html(health.get("progress"))
+            bar = _progress_html(row.health.progress)
             parts.append(f'<tr><td class="why" colspan="8">{html.escape("; ".join(notes))}{bar}</td></tr>')
     if not rows:
         parts.append('<tr><td class="why" colspan="8">No unit has registered yet.</td></tr>')
     return f'{STYLE}<div class="cw" data-cellwatch="units"><table>{"".join(parts)}</table></div>'
 
 
-def legend_html(by_unit: bool, rows: list[dict[str, Any]], is_told: bool) -> str:
+def legend_html(by_unit: bool, unit_ids: Sequence[int], is_told: bool) -> str:
     """What the colours of voxels tell; `is_told` is whether who reports them is known at all."""
     entries: list[tuple[Colour, str]]
     if not by_unit:
         counts = ("1 unit", "2 units", f"{len(WITNESS_COLOURS)} or more")
         entries = list(zip(WITNESS_COLOURS, counts, strict=True))
     elif is_told:
-        entries = [(unit_colour(row["id"]), f"unit {row['id']}") for row in rows] + [(SHARED_COLOUR, "several units")]
+        entries = [(unit_colour(unit_id), f"unit {unit_id}") for unit_id in unit_ids]
+        entries.append((SHARED_COLOUR, "several units"))
     else:
         entries = [(SHARED_COLOUR, "not recorded: this recording tells how many units report a voxel, not which")]
     chips = "".join(
@@ -165,9 +169,9 @@ def legend_html(by_unit: bool, rows: list[dict[str, Any]], is_told: bool) -> str
     return f'{STYLE}<div class="cw" data-cellwatch="legend">{chips}</div>'
 
 
-def confirm_html(row: dict[str, Any], loss: str) -> str:
+def confirm_html(row: UnitRow, loss: str) -> str:
     """Of which unit something would be lost, and what."""
-    unit = html.escape(f"unit {row['id']} · {row['ip']}, camera {row['serial']}")
+    unit = html.escape(f"unit {row.id} · {row.ip}, camera {row.serial}")
     return f'{STYLE}<div class="cw" data-cellwatch="confirm" style="padding-bottom:.8em"><b>{unit}</b><br>{loss}</div>'
 
 
@@ -175,11 +179,11 @@ def _of_files(count: int) -> str:
     return f" in {count} files" if count > 1 else ""
 
 
-def _progress_html(progress: dict[str, Any] | None) -> str:
+def _progress_html(progress: Progress | None) -> str:
     """How far a unit has come with what is to be waited for; empty where it tells nothing of the kind."""
     if progress is None:
         return ""
-    return f'<progress value="{int(progress["done"])}" max="{int(progress["total"])}"></progress>'
+    return f'<progress value="{progress.done}" max="{progress.total}"></progress>'
 
 
 def _css(state: str) -> str:
@@ -214,15 +218,14 @@ class Panel:
         """When the newest sample of the history was taken that is shown."""
         return self._history[-1].at_ns if self._history else -1
 
-    def show(self, told: dict[str, Any], wall_s: float) -> None:
+    def show(self, told: Look, wall_s: float) -> None:
         """The newest, with units."""
         self._status.content = status_html(told)
-        self._table.content = table_html(told["units"])
-        samples = [Sample(*values) for values in told["history"]]
-        if not samples:
+        self._table.content = table_html(told.units or ())
+        if not told.history:
             return
-        self._history.extend(samples)
-        offset_s = wall_s - told["now_ns"] / NS_PER_S
+        self._history.extend(told.history)
+        offset_s = wall_s - told.now_ns / NS_PER_S
         self._voxels.data = _curve([(sample.at_ns, float(sample.voxels)) for sample in self._history], offset_s)
         # A gap cannot be drawn: one value that is no number, and nothing of the curve is.
         ages_s = [(sample.at_ns, sample.oldest_view_age_s) for sample in self._history]
@@ -247,6 +250,51 @@ class Panel:
         )
 
 
+class Player:
+    """The controls of a recording, and where the slider was last moved to."""
+
+    def __init__(self, gui: viser.GuiApi, change: Callable[[dict[str, object]], None]) -> None:
+        """`change` is handed what is wanted of the replay."""
+        self._change = change
+        self._wanted_s: float | None = None
+        with gui.add_folder("Recording", order=0.5):
+            self._playing: Any = gui.add_checkbox("play", True)
+            self._speed = gui.add_dropdown("speed", ("0.1", "0.25", "0.5", "1", "2", "5", "10"), initial_value="1")
+            self._position: Any = gui.add_slider("time [s]", min=0.0, max=1.0, step=0.01, initial_value=0.0)
+        self._playing.on_update(lambda event: self._hear(event, self._play))
+        self._speed.on_update(lambda event: self._hear(event, self._hurry))
+        self._position.on_update(lambda event: self._hear(event, self._move))
+
+    def show(self, replayed: ReplayAnswer) -> None:
+        """How it stands, unless somebody is moving the slider."""
+        if self._wanted_s is None:
+            self._position.max = max(replayed.duration_s, 0.1)
+            self._position.value = min(replayed.position_s, self._position.max)
+            self._playing.value = replayed.playing
+
+    def go(self) -> None:
+        """Go where the slider was last moved to."""
+        wanted_s, self._wanted_s = self._wanted_s, None
+        if wanted_s is not None:
+            self._change({"position_s": wanted_s})
+
+    @staticmethod
+    def _hear(event: Any, do: Callable[[], None]) -> None:
+        # What the program itself set comes from nobody.
+        if event.client is not None:
+            do()
+
+    def _play(self) -> None:
+        self._change({"playing": bool(self._playing.value)})
+
+    def _hurry(self) -> None:
+        self._change({"speed": float(self._speed.value)})
+
+    def _move(self) -> None:
+        # A hand that moves it says a hundred places a second; the last one is where it goes.
+        self._wanted_s = float(self._position.value)
+
+
 class Person:
     """One who looks: what is theirs alone, and what they may do."""
 
@@ -261,13 +309,11 @@ class Person:
         self.client = client
         self.viewer = viewer
         self._asker = asker
-        self._units: dict[str, dict[str, Any]] = {}
+        self._units: dict[str, UnitRow] = {}
         self._unseen = UnseenLayer(client)
         self._ranges = RangeLayer(client)
         self._voxels = VoxelLayer(client)
-        self._position: Any = None
-        self._playing: Any = None
-        self.wanted_position_s: float | None = None
+        self._player: Player | None = None
         gui = client.gui
         with gui.add_folder("Look", order=2.0):
             self._colouring = gui.add_dropdown("voxels by", COLOURINGS)
@@ -279,7 +325,7 @@ class Person:
                 self._on_click(gui.add_button("What it sees"), self._show_pictures)
             self._pictures: Any = None
         if viewer is Viewer.OPERATOR and is_replay:
-            self._add_player(gui)
+            self._player = Player(gui, lambda change: self._do(partial(self._fetch, "PUT", "/replay", change)))
         elif viewer is Viewer.OPERATOR:
             self._do(partial(self._add_controls, gui, actions))
         elif not is_replay:
@@ -299,33 +345,29 @@ class Person:
         """Obstacles, in the colours that they want."""
         self._voxels.show(voxels, self.wants_by_unit)
 
-    def show(self, told: dict[str, Any]) -> None:
+    def show(self, told: Look) -> None:
         """The newest, with units."""
-        units = {f"{row['id']} · {row['ip']}": row for row in told["units"]}
+        rows = told.units or ()
+        units = {f"{row.id} · {row.ip}": row for row in rows}
         if units.keys() != self._units.keys():
             self._unit.options = tuple(units) or ("none",)
         self._units = units
-        is_told = not told["keys"] or told.get("reports") != {}
-        self._legend.content = legend_html(self.wants_by_unit, told["units"], is_told)
+        self._legend.content = legend_html(self.wants_by_unit, [row.id for row in rows], told.map.tells_who)
         if self._wants_ranges.value:
-            self._ranges.show(told["units"])
+            self._ranges.show(rows)
         else:
             self._ranges.hide()
-        if self.wants_unseen and "seen" in told:
-            self._unseen.show(told["seen"], lattice_of(told["blocks"]))
+        if self.wants_unseen and told.seen is not None:
+            self._unseen.show(told.seen.bits, told.seen.blocks.lattice())
         elif not self.wants_unseen:
             self._unseen.hide()
-        replayed = told.get("replay")
-        if replayed and self._position is not None and self.wanted_position_s is None:
-            self._position.max = max(replayed["duration_s"], 0.1)
-            self._position.value = min(replayed["position_s"], self._position.max)
-            self._playing.value = replayed["playing"]
+        if told.replay is not None and self._player is not None:
+            self._player.show(told.replay)
 
     def go(self) -> None:
         """Go where the slider was last moved to."""
-        wanted_s, self.wanted_position_s = self.wanted_position_s, None
-        if wanted_s is not None:
-            self._do(lambda: self._ask("PUT", "/replay", {"position_s": wanted_s}))
+        if self._player is not None:
+            self._player.go()
 
     # ------------------------------------------------------------------ inside
 
@@ -337,49 +379,26 @@ class Person:
                 colour: Any = "red" if loss else "gray"
                 do = partial(self._confirm, label, loss, method, path) if loss else partial(self._command, method, path)
                 self._on_click(gui.add_button(label, color=colour), do)
-        settings = self._ask("GET", "/settings")
+        settings = Settings.model_validate_json(self._fetch("GET", "/settings"))
         with gui.add_folder("Settings", order=4.0):
             numbers: dict[str, Any] = {
-                name: gui.add_number(label, float(settings[name]), min=least, max=most, step=step)
+                name: gui.add_number(label, float(getattr(settings, name)), min=least, max=most, step=step)
                 for name, label, least, most, step in SETTINGS
             }
 
             def apply() -> None:
-                changed = self._ask("PUT", "/settings", {name: number.value for name, number in numbers.items()})
+                wanted = {name: number.value for name, number in numbers.items()}
+                changed = Settings.model_validate_json(self._fetch("PUT", "/settings", wanted))
                 for name, number in numbers.items():
-                    number.value = float(changed[name])
+                    number.value = float(getattr(changed, name))
 
             self._on_click(gui.add_button("Apply"), apply)
-
-    def _add_player(self, gui: viser.GuiApi) -> None:
-        with gui.add_folder("Recording", order=0.5):
-            self._playing = gui.add_checkbox("play", True)
-            speed = gui.add_dropdown("speed", ("0.1", "0.25", "0.5", "1", "2", "5", "10"), initial_value="1")
-            self._position = gui.add_slider("time [s]", min=0.0, max=1.0, step=0.01, initial_value=0.0)
-
-        def play(event: Any) -> None:
-            # What the program itself set comes from nobody.
-            if event.client is not None:
-                self._do(lambda: self._ask("PUT", "/replay", {"playing": bool(self._playing.value)}))
-
-        def hurry(event: Any) -> None:
-            if event.client is not None:
-                self._do(lambda: self._ask("PUT", "/replay", {"speed": float(speed.value)}))
-
-        def go(event: Any) -> None:
-            if event.client is not None:
-                # A hand that moves it says a hundred places a second; the last one is where it goes.
-                self.wanted_position_s = float(self._position.value)
-
-        self._playing.on_update(play)
-        speed.on_update(hurry)
-        self._position.on_update(go)
 
     def _on_click(self, button: Any, do: Callable[[], Any]) -> None:
         button.on_click(lambda _: self._do(do))
 
     def _command(self, method: str, path: str) -> None:
-        self._ask(method, f"/units/{self._chosen()['id']}{path}")
+        self._fetch(method, f"/units/{self._chosen().id}{path}")
 
     def _confirm(self, label: str, loss: str, method: str, path: str) -> None:
         """Ask once more, of the unit that is chosen now."""
@@ -393,7 +412,7 @@ class Person:
 
         def act() -> None:
             modal.close()
-            self._ask(method, f"/units/{row['id']}{path}")
+            self._fetch(method, f"/units/{row.id}{path}")
 
         self._on_click(sure, act)
         self._on_click(back, modal.close)
@@ -406,26 +425,22 @@ class Person:
                 "Not done", str(error)[:SENTENCE_CHARS], color="red", auto_close_seconds=SHOWN_S
             )
 
-    def _chosen(self) -> dict[str, Any]:
+    def _chosen(self) -> UnitRow:
         row = self._units.get(self._unit.value)
         if row is None:
             raise Refusal(404, "no unit is chosen")
         return row
 
-    def _ask(self, method: str, path: str, body: Any = None) -> Any:
-        data = self._fetch(method, path, body)
-        return json.loads(data) if data else None
-
-    def _fetch(self, method: str, path: str, body: Any = None) -> bytes:
-        answer = self._asker.ask(verb="ask", method=method, path=path, body=body, viewer=self.viewer.value)
-        data = bytes(answer["body"])
-        if answer["status"] >= 400:
-            raise Refusal(answer["status"], _detail(data))
-        return data
+    def _fetch(self, method: str, path: str, body: object = None) -> bytes:
+        request = ApiRequest(method=method, path=path, body=body, viewer=self.viewer)
+        answer = self._asker.ask(request, ApiAnswer)
+        if answer.status >= 400:
+            raise Refusal(answer.status, _detail(answer.body))
+        return answer.body
 
     def _act(self, url: str) -> None:
         row = self._chosen()
-        address = url.format(id=row["id"], ip=quote(row["ip"]), serial=quote(row["serial"]))
+        address = url.format(id=row.id, ip=quote(row.ip), serial=quote(row.serial))
         try:
             response = httpx.post(address, timeout=ACTION_S, trust_env=False)
         except (httpx.HTTPError, httpx.InvalidURL) as error:
@@ -436,11 +451,11 @@ class Person:
     def _show_pictures(self) -> None:
         row = self._chosen()
         images = [
-            np.asarray(iio.imread(io.BytesIO(self._fetch("GET", f"/units/{row['id']}/images/{kind}"))))[..., :3]
+            np.asarray(iio.imread(io.BytesIO(self._fetch("GET", f"/units/{row.id}/images/{kind}"))))[..., :3]
             for kind in PICTURES
         ]
         sheet = contact_sheet(images)
-        label = f"unit {row['id']}: measured, expected; below: what remains"
+        label = f"unit {row.id}: measured, expected; below: what remains"
         if self._pictures is not None:
             self._pictures.remove()
         self._pictures = self.client.gui.add_image(sheet, label=label, order=2.5)
@@ -454,11 +469,6 @@ def contact_sheet(images: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
     sheet[:height, :width], sheet[:height, width:] = first, second
     sheet[height:, :width] = third
     return sheet
-
-
-def lattice_of(described: dict[str, Any]) -> Lattice:
-    """A lattice as a look tells it."""
-    return Lattice(tuple(described["origin_m"]), described["voxel_size_m"], tuple(described["shape"]))
 
 
 def _detail(body: bytes) -> str:

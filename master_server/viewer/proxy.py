@@ -14,7 +14,6 @@ import hashlib
 import logging
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 import msgpack
@@ -146,7 +145,7 @@ def _read_page() -> bytes:
 
 
 def _gate(connection: HTTPConnection) -> Gate:
-    gate = connection.app.state.viewer
+    gate = connection.app.gate
     assert isinstance(gate, Gate)
     return gate
 
@@ -246,7 +245,7 @@ async def window(websocket: WebSocket) -> None:
         log_refusal(websocket.scope, refusal)
         await websocket.send_denial_response(refused(refusal))
         return
-    fields: dict[str, Any] = {"event": "viewer", "ip": ip_of(websocket.scope)}
+    fields = {"event": "viewer", "ip": ip_of(websocket.scope)}
     gate.looking += 1
     try:
         logger.info("viewer: %s looks as %s (%d in all)", fields["ip"], viewer.value, gate.looking, extra=fields)

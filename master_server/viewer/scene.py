@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import viser
@@ -15,6 +15,7 @@ from viser.transforms import SO3
 from shared.camera import Intrinsics
 from shared.cell import Cell, PlacedMesh
 from shared.lattice import Lattice
+from shared.messages import Matrix, UnitRow
 
 Colour = tuple[int, int, int]
 
@@ -77,7 +78,7 @@ VIEW_FROM = np.array([0.98, 0.6, 0.66])
 VIEW_FOV_RAD = 0.8
 """Of who looks, vertically."""
 
-Points = NDArray[np.float32]
+Points: TypeAlias = NDArray[np.float32]
 
 
 PYRAMID = np.array([(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)])
@@ -228,15 +229,15 @@ class Scene:
                 link.position = pose[:3, 3]
                 link.visible = True
 
-    def set_units(self, rows: list[dict[str, Any]]) -> None:
+    def set_units(self, rows: Sequence[UnitRow]) -> None:
         """A pyramid a unit whose pose is known, in the colour of its state."""
-        posed = {row["id"]: row for row in rows if row["T_world_camera"] is not None}
+        posed = {row.id: row for row in rows if row.T_world_camera is not None}
         for unit_id in self._cameras.keys() - posed.keys():
             for part in self._cameras.pop(unit_id):
                 part.remove()
             self._told.pop(unit_id, None)
         for unit_id, row in posed.items():
-            told = (row["state"], row["T_world_camera"], row["intrinsics"])
+            told = (row.state, row.T_world_camera, row.intrinsics)
             if self._told.get(unit_id) != told:
                 self._told[unit_id] = told
                 self._draw_camera(unit_id, row)
@@ -253,22 +254,22 @@ class Scene:
             position=body.T_world_mesh[:3, 3],
         )
 
-    def _draw_camera(self, unit_id: int, row: dict[str, Any]) -> None:
-        pose = np.asarray(row["T_world_camera"])
-        state = row["state"]
+    def _draw_camera(self, unit_id: int, row: UnitRow) -> None:
+        pose = np.asarray(row.T_world_camera)
+        state = row.state
         for part in self._cameras.pop(unit_id, ()):
             part.remove()
         text = f"{unit_id}" if state == "live" else f"{unit_id} {state}"
         label = self._server.scene.add_label(
             f"/labels/{unit_id}", text, position=pose[:3, 3] + (0.0, 0.0, 0.15), anchor="bottom-center"
         )
-        if row["intrinsics"] is None:
+        if row.intrinsics is None:
             # A recording of before units' intrinsics were kept: where it is, and not what it looks at.
             self._cameras[unit_id] = (label,)
             return
         pyramid = self._server.scene.add_line_segments(
             f"/cameras/{unit_id}",
-            view_edges(Intrinsics(**row["intrinsics"]), FRUSTUM_M),
+            view_edges(row.intrinsics, FRUSTUM_M),
             STATE_COLOURS[state],
             thickness=FRUSTUM_LINE_M,
             wxyz=wxyz_of(pose),
@@ -354,23 +355,24 @@ class RangeLayer:
         self._parts: dict[int, Any] = {}
         self._drawn: dict[int, tuple[object, ...]] = {}
 
-    def show(self, rows: list[dict[str, Any]]) -> None:
+    def show(self, rows: Sequence[UnitRow]) -> None:
         """Draw it: what each camera looks through, down to the farthest block that it sees."""
-        shown = {row["id"]: row for row in rows if _has_range(row)}
+        known = {row.id: _range_of(row) for row in rows if row.state == "live"}
+        shown = {unit_id: drawn for unit_id, drawn in known.items() if drawn is not None}
         for unit_id in self._parts.keys() - shown.keys():
             self._parts.pop(unit_id).remove()
             del self._drawn[unit_id]
-        for unit_id, row in shown.items():
-            drawn = (row["range_m"], row["T_world_camera"], row["intrinsics"])
+        for unit_id, drawn in shown.items():
             if self._drawn.get(unit_id) == drawn:
                 continue
             self._drawn[unit_id] = drawn
-            pose = np.asarray(row["T_world_camera"])
-            shade = RANGE_SHADE * np.array(STATE_COLOURS[row["state"]]) + (1.0 - RANGE_SHADE) * 255.0
+            range_m, T_world_camera, intrinsics = drawn
+            pose = np.asarray(T_world_camera)
+            shade = RANGE_SHADE * np.array(STATE_COLOURS["live"]) + (1.0 - RANGE_SHADE) * 255.0
             # One of the same name takes the place of the one before.
             self._parts[unit_id] = self._client.scene.add_line_segments(
                 f"/ranges/{unit_id}",
-                view_edges(Intrinsics(**row["intrinsics"]), row["range_m"]),
+                view_edges(intrinsics, range_m),
                 shade.astype(np.uint8),
                 thickness=RANGE_LINE_PX,
                 thickness_units="screen",
@@ -383,9 +385,11 @@ class RangeLayer:
         self.show([])
 
 
-def _has_range(row: dict[str, Any]) -> bool:
-    known = (row["T_world_camera"], row["intrinsics"], row["range_m"])
-    return row["state"] == "live" and all(value is not None for value in known)
+def _range_of(row: UnitRow) -> tuple[float, Matrix, Intrinsics] | None:
+    """How far a camera looks, from where and how; None while any of it is not known."""
+    if row.range_m is None or row.T_world_camera is None or row.intrinsics is None:
+        return None
+    return row.range_m, row.T_world_camera, row.intrinsics
 
 
 class UnseenLayer:

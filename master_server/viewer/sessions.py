@@ -33,7 +33,7 @@ COOKIE_MAX_CHARS = 256
 """Of a cookie, about three times what ours take."""
 
 
-class Viewer(Enum):
+class Viewer(str, Enum):
     """What somebody in front of the window may do."""
 
     READER = "reader"

@@ -15,10 +15,20 @@ import numpy as np
 import viser
 
 from master_server.viewer.channel import Asker
-from master_server.viewer.panel import Panel, Person, lattice_of
+from master_server.viewer.messages import (
+    ApiAnswer,
+    ApiRequest,
+    BeginAnswer,
+    BeginRequest,
+    Look,
+    LookRequest,
+    MapBits,
+    ReadyAnswer,
+    ReadyRequest,
+)
+from master_server.viewer.panel import Panel, Person
 from master_server.viewer.scene import Scene, Voxels
 from master_server.viewer.sessions import Viewer
-from master_server.viewer.snapshot import Wanted
 from shared.cell import Cell
 from shared.clock import NS_PER_S, monotonic_ns, wall_ns
 from shared.errors import CellwatchError, Refusal
@@ -39,18 +49,18 @@ NICE = 5
 class Window:
     """What is drawn for all who look."""
 
-    def __init__(self, asker: Asker, beginning: dict[str, Any]) -> None:
+    def __init__(self, asker: Asker, beginning: BeginAnswer) -> None:
         self._asker = asker
-        self._key = f"Bearer {beginning['key']}"
-        self._actions: dict[str, str] = beginning["actions"]
-        self._is_replay: bool = beginning["is_replay"]
+        self._key = f"Bearer {beginning.key}"
+        self._actions = beginning.actions
+        self._is_replay = beginning.is_replay
         self._people: dict[int, Person] = {}
         self._may: dict[int, Viewer] = {}
         self._lock = threading.Lock()
         self._somebody_came = threading.Event()
         self._cell: Cell | None = None
         self._cell_sha256 = ""
-        self._drawn: tuple[object, ...] = ()
+        self._drawn: MapBits | None = None
         self._voxels: Voxels | None = None
         self.server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         # Nobody opens a tunnel to the world from here; the master does not pass such requests on, either.
@@ -112,27 +122,23 @@ class Window:
     def _draw(self, people: list[Person], with_units: bool) -> None:
         for person in people:
             person.go()
-        wanted = Wanted(
+        request = LookRequest(
             units=with_units,
             unseen=with_units and any(person.wants_unseen for person in people),
             reports=any(person.wants_by_unit for person in people),
             since_ns=self._panel.known_ns,
         )
-        told = self._asker.ask(verb="look", wanted=wanted._asdict())
-        if "refused" in told:
-            raise Refusal(500, told["refused"])
-        if told["cell"] != self._cell_sha256:
-            self._load_cell(told["cell"])
-        joints = told["joints"]
-        self._scene.set_joints(None if joints is None else tuple(joints))
-        drawn = (told["keys"], told["witnesses"], told["lattice"], told.get("reports", {}))
-        if drawn != self._drawn:
-            self._drawn, self._voxels = drawn, voxels_of(told)
+        told = self._asker.ask(request, Look)
+        if told.cell != self._cell_sha256:
+            self._load_cell(told.cell)
+        self._scene.set_joints(told.joints)
+        if told.map != self._drawn:
+            self._drawn, self._voxels = told.map, voxels_of(told.map)
         assert self._voxels is not None
         for person in people:
             person.draw(self._voxels)
-        if with_units:
-            self._scene.set_units(told["units"])
+        if told.units is not None:
+            self._scene.set_units(told.units)
             self._panel.show(told, wall_ns() / NS_PER_S)
             for person in people:
                 person.show(told)
@@ -145,23 +151,23 @@ class Window:
         }
         cell = Cell.from_document(document, meshes, self._cell)
         self._scene.set_cell(cell)
-        self._cell, self._cell_sha256, self._drawn = cell, sha256, ()
+        self._cell, self._cell_sha256, self._drawn = cell, sha256, None
 
     def _get(self, path: str) -> bytes:
-        answer = self._asker.ask(verb="ask", method="GET", path=path, body=None, viewer=Viewer.READER.value)
-        if answer["status"] != 200:
-            raise Refusal(answer["status"], f"{path}: the master answers {answer['status']}")
-        return bytes(answer["body"])
+        answer = self._asker.ask(ApiRequest(method="GET", path=path, viewer=Viewer.READER), ApiAnswer)
+        if answer.status != 200:
+            raise Refusal(answer.status, f"{path}: the master answers {answer.status}")
+        return answer.body
 
     def _rest(self, seconds: float) -> None:
         threading.Event().wait(max(seconds, 0.0))
 
 
-def voxels_of(told: dict[str, Any]) -> Voxels:
-    """The obstacles of a look."""
-    reports = {unit_id: np.frombuffer(keys, np.uint32) for unit_id, keys in told.get("reports", {}).items()}
-    keys, witnesses = np.frombuffer(told["keys"], np.uint32), np.frombuffer(told["witnesses"], np.uint8)
-    return Voxels.of(lattice_of(told["lattice"]), keys, witnesses, reports)
+def voxels_of(told: MapBits) -> Voxels:
+    """The obstacles of a map."""
+    reports = {unit_id: np.frombuffer(keys, np.uint32) for unit_id, keys in (told.reports or {}).items()}
+    keys, witnesses = np.frombuffer(told.keys, np.uint32), np.frombuffer(told.witnesses, np.uint8)
+    return Voxels.of(told.lattice.lattice(), keys, witnesses, reports)
 
 
 def _named_meshes(document: dict[str, Any]) -> set[str]:
@@ -186,8 +192,8 @@ def main(arguments: list[str]) -> None:
         os._exit(0)
 
     threading.Thread(target=listen, daemon=True).start()
-    window = Window(asker, asker.ask(verb="begin"))
-    asker.ask(verb="ready", port=window.server.get_port())
+    window = Window(asker, asker.ask(BeginRequest(), BeginAnswer))
+    asker.ask(ReadyRequest(port=window.server.get_port()), ReadyAnswer)
     window.run()
     # Its server's threads have nobody left to wait for.
     os._exit(0)

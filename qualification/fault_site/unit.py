@@ -13,10 +13,8 @@ from collections.abc import AsyncGenerator
 
 import numpy as np
 
-import edge_unit.source_factory
 from edge_unit.__main__ import main
-from edge_unit.config import SourceConfig
-from edge_unit.sources.frame import DepthFrame, DepthSource
+from edge_unit.sources.frame import DepthFrame
 from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
 from qualification.fault_site.scene import FPS, IMAGE
 from shared.clock import NS_PER_S, monotonic_ns
@@ -41,12 +39,5 @@ class PictureSource(RecordedSource):
             due_ns = max(due_ns + period_ns, captured_at_ns)
 
 
-def make_source(config: SourceConfig) -> DepthSource:
-    """The source of a configuration whose kind is `recorded`."""
-    assert isinstance(config, RecordedSourceConfig)
-    return PictureSource(config)
-
-
 if __name__ == "__main__":
-    edge_unit.source_factory.make_source = make_source
-    sys.exit(main(["run", *sys.argv[1:]]))
+    sys.exit(main(["run", *sys.argv[1:]], {RecordedSourceConfig: PictureSource}))

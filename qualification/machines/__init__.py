@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Machines that boot, for `make rehearsal` and `make image-test`.
+"""Machines that boot, for `make rehearsal` and `make image-test`, and fresh ones, for `make fresh-machine`.
 
 In the order of the flow:
 
@@ -7,4 +7,5 @@ In the order of the flow:
     containers    machines that boot systemd from one read-only root file system
     image_parts   the image that arm64 boards boot in QEMU, built as a board's is
     arm64_boards  an arm64 board in QEMU
+    fresh_debian  a Debian with only Python and make, and what a newcomer runs there
 """

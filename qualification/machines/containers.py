@@ -76,7 +76,7 @@ def why_not() -> str | None:
             return f"{command} is not installed"
     if not allowed(NAMESPACES):
         return "the kernel does not allow network, mount and process namespaces"
-    if (trouble := _container_trouble()) is not None:
+    if (trouble := container_trouble()) is not None:
         return f"systemd-nspawn starts no container here: {trouble}"
     bridge = ("unshare", "--net", "ip", "link", "add", BRIDGE, "type", "bridge")
     if subprocess.run(bridge, capture_output=True, check=False).returncode:
@@ -84,7 +84,7 @@ def why_not() -> str | None:
     return None
 
 
-def _container_trouble() -> str | None:
+def container_trouble() -> str | None:
     """What keeps the smallest of containers from running `true`."""
     with tempfile.TemporaryDirectory() as folder:
         for name in ("bin", "lib", "lib64", "sbin"):
@@ -101,9 +101,9 @@ def _container_trouble() -> str | None:
     return done.stderr.strip() if done.returncode else None
 
 
-def confine(module: str, arguments: Sequence[str]) -> None:
+def confine(module: str, arguments: Sequence[str], namespaces: Sequence[str] = NAMESPACES) -> None:
     """Run `python -m module --inside arguments` in this process's place, in namespaces of its own."""
-    os.execvp(NAMESPACES[0], (*NAMESPACES, sys.executable, "-m", module, "--inside", *arguments))
+    os.execvp(namespaces[0], (*namespaces, sys.executable, "-m", module, "--inside", *arguments))
 
 
 def make_network() -> None:

@@ -10,9 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import AsyncGenerator
 
-import edge_unit.source_factory
 from edge_unit.__main__ import main
-from edge_unit.config import SourceConfig
 from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
 from edge_unit.sources.recorded import RecordedSourceConfig
 from edge_unit.sources.simulated import SimulatedSourceConfig
@@ -42,13 +40,11 @@ class PluggedSource(PictureSource):
             await frames.aclose()
 
 
-def make_source(config: SourceConfig) -> DepthSource:
-    """The source of a configuration whose kind is `simulated`."""
-    assert isinstance(config, SimulatedSourceConfig)
+def plugged_source(config: SimulatedSourceConfig) -> DepthSource:
+    """Make the camera whose picture lies beside its `handling`."""
     assert config.handling is not None
     return PluggedSource(RecordedSourceConfig(folder=config.handling.parent, serial=config.serial, fps=FPS))
 
 
 if __name__ == "__main__":
-    edge_unit.source_factory.make_source = make_source
-    sys.exit(main(["run", *sys.argv[1:]]))
+    sys.exit(main(["run", *sys.argv[1:]], {SimulatedSourceConfig: plugged_source}))

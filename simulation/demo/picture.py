@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -68,7 +69,7 @@ CUBE_FACES = np.array(
 )  # fmt: skip
 """Of the corners above, anticlockwise from outside."""
 
-Colours = NDArray[np.float64]
+Colours: TypeAlias = NDArray[np.float64]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -112,7 +113,7 @@ def merged_map(world: World, t_s: float) -> tuple[Lattice, NDArray[np.uint32], N
     reports = []
     for index, pose in enumerate(rig(world.cell)):
         frame = SimulatedCamera(world, pose, intrinsics, seed=index).capture(t_s)
-        voxels = DepthPipeline(intrinsics, pose, world.cell).process(frame.depth, frame.joints)
+        voxels = DepthPipeline(intrinsics, pose, world.cell).process(frame.depth, frame.joints).voxels
         reports.append(voxels.keys)
     keys, witnesses = np.unique(np.concatenate(reports), return_counts=True)
     return voxels.lattice, keys, witnesses

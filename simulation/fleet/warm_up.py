@@ -26,8 +26,6 @@ def warm_up() -> None:
     finder.find(frame.view)
     pipeline.process(np.zeros(intrinsics.shape, np.uint16), frame.joints)
     pipeline.process(frame.depth, frame.joints)
-    pipeline.health()
-    pipeline.seen()
 
 
 if __name__ == "__main__":

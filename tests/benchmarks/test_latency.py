@@ -20,15 +20,16 @@ from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 
 MS = NS_PER_MS
 
+INSTANT = {"seen": 0, "health": 0}
 UNIT_STAGES = ("source", "joints", "thread", "robot", "filter", "density", "check", "report")
 
 
 def record(number: int, captured_ms: int, sent: bool = True) -> TraceRecord:
-    """Each stage at the unit takes 1 ms, the queue 2, the transfer 3, the merge 4: 17 in all."""
+    """Each stage at the unit takes 1 ms, two nothing, the queue 2, the transfer 3, the merge 4: 17 in all."""
     at_ns = captured_ms * MS
     return TraceRecord(
         number, at_ns, 1.5, b"", (4, 5, 6), 0.05, sent,
-        at_ns + 17 * MS if sent else None, at_ns + 10 * MS, at_ns + 13 * MS, dict.fromkeys(UNIT_STAGES, MS),
+        at_ns + 17 * MS if sent else None, at_ns + 10 * MS, at_ns + 13 * MS, dict.fromkeys(UNIT_STAGES, MS) | INSTANT,
     )  # fmt: skip
 
 
@@ -50,7 +51,7 @@ def test_stages_and_the_first_map_that_has_the_frame() -> None:
     assert found.ms[f"{LISTENING}: until the next message is made"].tolist() == [2.0, 2.0]
     assert found.ms[WHOLE[ASKING]].tolist() == [66.0, 33.0]
     told = result([found])
-    assert [row[1] for row in told.rows[: len(STAGES)]] == [1.0] * 8 + [2.0, 3.0, 4.0]
+    assert [row[1] for row in told.rows[: len(STAGES)]] == [1.0] * 6 + [0.0, 0.0, 1.0, 1.0] + [2.0, 3.0, 4.0]
     assert told.marks[0].met
 
 

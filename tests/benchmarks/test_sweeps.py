@@ -113,7 +113,7 @@ def test_only_what_is_reported_where_the_thing_stands_counts() -> None:
     def at(x_m: float) -> Body:
         return Body("box", mesh, from_rotation_translation(np.eye(3), (x_m, 0.0, 0.15)), Owner.UNKNOWN)
 
-    voxels = stage.pipeline(FilterSettings()).process(stage.frame(at(0.3)).depth, None)
+    voxels = stage.pipeline(FilterSettings()).process(stage.frame(at(0.3)).depth, None).voxels
     assert reported_at(voxels, at(0.3))
     assert not reported_at(voxels, at(-0.3))
 

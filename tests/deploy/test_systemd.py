@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import configparser
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
 from edge_unit.config import UnitConfig
+from tests.missing import need_command
 
 SYSTEMD = Path(__file__).parents[2] / "deploy" / "systemd"
 SERVICES = sorted(SYSTEMD.glob("*.service"))
@@ -33,8 +33,6 @@ KNOWN_TO_249 = {
 }
 """What is used, each looked up in the manual of systemd 249; others are looked up there before they are added."""
 
-needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze here")
-
 
 class UnitFile(configparser.RawConfigParser):
     """A unit file: keys keep their case; of those that come twice the last is enough here."""
@@ -48,10 +46,10 @@ class UnitFile(configparser.RawConfigParser):
 
 
 def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
+    need_command("systemd-analyze", "systemd")
     return subprocess.run(["systemd-analyze", *arguments], capture_output=True, text=True, timeout=60, check=False)
 
 
-@needs_systemd
 @pytest.mark.parametrize("service", DAEMONS, ids=lambda path: path.name)
 def test_systemd_has_nothing_to_say(service: Path) -> None:
     verified = analyze("verify", str(service))
@@ -59,14 +57,12 @@ def test_systemd_has_nothing_to_say(service: Path) -> None:
     assert (verified.returncode, verified.stderr, verified.stdout) == (0, "", "")
 
 
-@needs_systemd
 def test_systemd_would_say_something(tmp_path: Path) -> None:
     wrong = tmp_path / "edge-unit.service"
     wrong.write_text(DAEMONS[0].read_text().replace("RestartSec=1", "RestartSeconds=1"))
     assert "RestartSeconds" in analyze("verify", str(wrong)).stderr
 
 
-@needs_systemd
 @pytest.mark.parametrize("service", DAEMONS, ids=lambda path: path.name)
 def test_little_is_left_to_whoever_breaks_in(service: Path) -> None:
     judged = analyze("security", "--offline=true", f"--threshold={round(10 * EXPOSURE_MAX)}", str(service))

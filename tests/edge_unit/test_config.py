@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import SecretStr
 
-from edge_unit.config import ENVIRONMENT_PREFIX, PoseConfig, UnitConfig, default_state_dir
+from edge_unit.config import ENVIRONMENT_PREFIX, PoseConfig, UnitConfig
 from edge_unit.sources.recorded import RecordedSourceConfig, read_pose
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from shared.configuration import load
@@ -117,6 +117,7 @@ def test_a_pose_file_that_holds_none_is_named(tmp_path: Path, text: str) -> None
 def test_state_lies_where_the_service_manager_wants_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
-    assert default_state_dir() == tmp_path / "cellwatch" / "edge-unit"
+    config = UnitConfig(source=SimulatedSourceConfig())
+    assert config.state_dir == tmp_path / "cellwatch" / "edge-unit"
     monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/a")
-    assert default_state_dir() == Path("/var/lib/a")
+    assert UnitConfig(source=SimulatedSourceConfig()).state_dir == Path("/var/lib/a")

@@ -52,7 +52,7 @@ class Desk:
 
     async def register(self, ip: str = "10.0.0.1", serial: str = "A") -> FakeUnit:
         """A unit that has its slot and has told its pose, all over HTTP."""
-        unit = FakeUnit(self.app.state.master, ip, serial)
+        unit = FakeUnit(self.app.services.master, ip, serial)
         sent_ns = monotonic_ns()
         request = unit.introduction(sent_ns)
         response = await self.call("POST", "/initialize", UNIT, ip, content=encode(request), headers=MSGPACK)
@@ -346,7 +346,7 @@ async def test_what_is_no_json_is_said_of_the_body(desk: Desk) -> None:
 
 @pytest.mark.parametrize("field", ["serial", "model", "software", "boot_id"])
 async def test_a_unit_cannot_write_lines_into_logs(desk: Desk, field: str) -> None:
-    body = FakeUnit(desk.app.state.master).introduction(monotonic_ns()).model_dump() | {field: "A\nERROR \x1b[2J"}
+    body = FakeUnit(desk.app.services.master).introduction(monotonic_ns()).model_dump() | {field: "A\nERROR \x1b[2J"}
     response = await desk.call("POST", "/initialize", UNIT, content=msgpack.packb(body), headers=MSGPACK)
     assert response.status_code == 422
     assert field in response.json()["detail"]
@@ -385,7 +385,7 @@ async def test_the_cell_and_its_meshes(desk: Desk) -> None:
     assert response.headers["etag"] == f'"{unit.initialized.cell.sha256}"'
     sha256 = next(frame["mesh"] for frame in document["robot"]["frames"] if frame["mesh"])
     mesh = await desk.call("GET", f"/cell/meshes/{sha256}", UNIT)
-    assert mesh.content == desk.app.state.master.published.meshes[sha256]
+    assert mesh.content == desk.app.services.master.published.meshes[sha256]
     assert "immutable" in mesh.headers["cache-control"]
 
 

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from master_server.config import MasterConfig, default_state_dir
+from master_server.config import MasterConfig
 
 
 def test_state_lies_where_the_service_manager_wants_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
-    assert default_state_dir() == tmp_path / "cellwatch" / "master"
+    assert MasterConfig(cell=Path("cell.yaml")).state_dir == tmp_path / "cellwatch" / "master"
     monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/a:/var/lib/b")
     assert MasterConfig(cell=Path("cell.yaml")).state_dir == Path("/var/lib/a")
 

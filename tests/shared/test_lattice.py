@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shared.errors import InputError
-from shared.lattice import MAX_AXIS, MAX_CELLS, Lattice
+from shared.lattice import MAX_AXIS, MAX_BLOCKS, MAX_CELLS, Lattice, block_lattice
 
 lattices = st.builds(
     Lattice,
@@ -254,3 +254,11 @@ def test_keys_and_indices_are_each_others_inverse_and_keys_ascend_as_indices_do(
     for outside in (lattice.cell_count, 2**32 - 1):
         with pytest.raises(InputError, match="key"):
             lattice.indices(np.array([*keys.tolist(), outside], np.uint32))
+
+
+def test_a_hall_has_larger_blocks() -> None:
+    low, high = np.zeros(3), np.array([100.0, 100.0, 10.0])
+    blocks = block_lattice(low, high, 0.05)
+    assert blocks.cell_count <= MAX_BLOCKS < 8 * blocks.cell_count
+    assert blocks.voxel_size_m == 0.05 * 2**5
+    assert block_lattice(low, np.ones(3), 0.1) == Lattice.covering(low, np.ones(3), 0.1)

@@ -136,3 +136,23 @@ def test_what_is_no_pose_is_refused(value: Any, words: str) -> None:
 def test_pose_with_few_digits_is_taken() -> None:
     written = np.round(transforms.from_xyz_rpy((0.1, 0.2, 0.3), (0.4, 0.5, 0.6)), 5)
     np.testing.assert_array_equal(transforms.validated(written, "T"), written)
+
+
+@pytest.mark.parametrize("off", [1e-8, -3e-7, 1e-6])
+def test_rounding_in_the_last_row_is_taken_out(off: float) -> None:
+    """As an inverse in float32 leaves it, whichever of the four it is in."""
+    pose = transforms.from_xyz_rpy((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
+    for column in range(4):
+        rounded = pose.copy()
+        rounded[3, column] += off * (1.0 - 1e-9)
+        np.testing.assert_array_equal(transforms.validated(rounded, "T"), pose)
+        assert rounded[3, column] != pose[3, column]
+
+
+def test_a_last_row_that_is_off_by_more_than_rounding_is_refused_as_it_came() -> None:
+    for column in range(4):
+        skewed = np.eye(4)
+        skewed[3, column] += 2e-6
+        with pytest.raises(InputError, match="expected the last row 0 0 0 1, got ") as refused:
+            transforms.validated(skewed, "T_a_b")
+        assert str(skewed[3].tolist()) in str(refused.value)

@@ -30,6 +30,9 @@ PORT = 8420
 MOVED_S = 8.0
 """A master at a new address is found within a few seconds: 2 s until it is missed, its probing, a busy machine."""
 
+LATE_S = 30.0
+"""A unit whose address comes after it began tries again every few seconds; the rest is for a busy machine."""
+
 
 @pytest.fixture(scope="module", autouse=True)
 def namespaces() -> None:
@@ -108,8 +111,8 @@ def test_a_unit_finds_its_master_and_follows_it_to_another_address(site: Site) -
     desk.add("10.78.0.50")
     moved = ("live → searching: ", "searching → registering: at http://10.78.0.50:8420", "fetching → live: ")
     site.until_said("unit", *moved, timeout_s=MOVED_S)
-    print(f"live at the new address after {time.monotonic() - began:.1f} s")
-    until(lambda: live(board, "10.78.0.50") == {"10.78.0.2": ("live", "live")}, "a live unit", MOVED_S)
+    left_s = MOVED_S - (time.monotonic() - began)
+    until(lambda: live(board, "10.78.0.50") == {"10.78.0.2": ("live", "live")}, "a live unit", left_s)
     # Few lines, and one when it was missed.
     assert len(site.log("unit").splitlines()) < 30
 
@@ -132,9 +135,7 @@ def test_a_network_that_comes_up_late_is_used(site: Site) -> None:
     site.lan.plug(board)
     site.until_said("unit", "no master is announced on this network")
     board.add("10.78.0.2")
-    began = time.monotonic()
-    until(lambda: live(desk, "10.78.0.1") == {"10.78.0.2": ("live", "live")}, "a live unit", 30.0)
-    print(f"live {time.monotonic() - began:.1f} s after the address came")
+    until(lambda: live(desk, "10.78.0.1") == {"10.78.0.2": ("live", "live")}, "a live unit", LATE_S)
 
 
 def test_a_master_whose_network_comes_up_late_is_found(site: Site) -> None:

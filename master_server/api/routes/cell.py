@@ -14,6 +14,7 @@ from master_server.api.routes.common import (
     OPERATOR_ONLY,
     READERS,
     MasterDependency,
+    MasterServicesDependency,
     Negotiated,
     ReadableDependency,
     body_of,
@@ -61,14 +62,13 @@ async def cell(master: ReadableDependency, response: Response) -> dict[str, Any]
         }
     },
 )
-async def change_cell(request: Request, master: MasterDependency) -> CellAnswer:
+async def change_cell(request: Request, services: MasterServicesDependency) -> CellAnswer:
     """Watch another cell from now on.
 
     Either its folder as a zip (`cell.yaml` at the root or in the one top folder, with the files that it names), or the
     document of `GET /cell`, edited, with meshes of the current cell. What is no cell changes nothing.
     """
-    loader = request.app.state.loader
-    assert isinstance(loader, CellLoader)
+    loader, master = services.loader, services.master
     kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
     async with loader.folder() as folder:
         if kind == ZIP:

@@ -16,8 +16,9 @@ from starlette.requests import ClientDisconnect, HTTPConnection
 from starlette.responses import JSONResponse
 from starlette.types import Message, Scope
 
+from master_server.api.map_stream import Stream
+from master_server.api.services import MasterServices, Services
 from master_server.core import Master, Readable
-from master_server.recording.replay import Replay
 from master_server.security import Access, Limits, Role, plain_ip
 from master_server.security.auth import ANYONE, OPERATORS, UNITS
 from shared.clock import monotonic_ns
@@ -147,37 +148,56 @@ def wants_msgpack(request: Request) -> bool:
 # Dependencies are coroutines throughout: the framework sends plain functions to a thread, at ten times the cost.
 
 
-async def master_of(request: Request) -> Master:
-    """The one master of this application, for those who change something.
+async def services_of(request: HTTPConnection) -> Services:
+    """What the routes of this application work with."""
+    return _services(request)
+
+
+async def master_services_of(request: HTTPConnection) -> MasterServices:
+    """The same of a master, for those who change something.
 
     Raises:
         Refusal: 409, it is a replay.
     """
-    master = request.app.state.master
-    if isinstance(master, Replay):
+    services = _services(request)
+    if not isinstance(services, MasterServices):
         raise Refusal(409, IS_REPLAY)
-    assert isinstance(master, Master)
-    return master
+    return services
 
 
-async def readable_of(request: Request) -> Readable:
+ServicesDependency = Annotated[Services, Depends(services_of)]
+MasterServicesDependency = Annotated[MasterServices, Depends(master_services_of)]
+
+
+async def master_of(services: MasterServicesDependency) -> Master:
+    """The one master of this application; raises as `master_services_of`."""
+    return services.master
+
+
+async def readable_of(services: ServicesDependency) -> Readable:
     """The master of this application, or the recording of one, for those who only read."""
-    readable: Readable = request.app.state.master
-    return readable
+    return services.master
 
 
 def access_of(request: HTTPConnection) -> Access:
     """The tokens of this application."""
-    access = request.app.state.access
-    assert isinstance(access, Access)
-    return access
+    return _services(request).access
 
 
 def limits_of(request: HTTPConnection) -> Limits:
     """What each address may ask for."""
-    limits = request.app.state.limits
-    assert isinstance(limits, Limits)
-    return limits
+    return _services(request).limits
+
+
+def stream_of(request: HTTPConnection) -> Stream:
+    """The listeners of this application."""
+    return _services(request).stream
+
+
+def _services(request: HTTPConnection) -> Services:
+    services = request.app.services
+    assert isinstance(services, Services)
+    return services
 
 
 def role_of(request: HTTPConnection, allowed: frozenset[Role], authorization: bytes | None = None) -> Role:

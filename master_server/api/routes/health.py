@@ -5,12 +5,12 @@ from __future__ import annotations
 
 from typing import Literal
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel, Field
 
-from master_server.api.metrics import VERSION, Metrics
-from master_server.api.routes.common import READERS, MasterDependency
+from master_server.api.metrics import VERSION
+from master_server.api.routes.common import READERS, MasterServicesDependency
 from shared.clock import NS_PER_S, monotonic_ns
 
 router = APIRouter(tags=["health"])
@@ -28,13 +28,13 @@ class HealthAnswer(BaseModel):
 
 
 @router.get("/healthz")
-async def healthz(request: Request, master: MasterDependency) -> HealthAnswer:
+async def healthz(services: MasterServicesDependency) -> HealthAnswer:
     """Answers while the event loop runs; whether the map is complete, `GET /voxels` tells."""
-    now_ns = monotonic_ns()
+    master, now_ns = services.master, monotonic_ns()
     return HealthAnswer(
         status="ok",
         version=VERSION,
-        uptime_s=round((now_ns - request.app.state.started_at_ns) / NS_PER_S, 1),
+        uptime_s=round((now_ns - services.started_at_ns) / NS_PER_S, 1),
         units=len(master.registry),
         live=sum(master.judge(slot, now_ns)[0] == "live" for slot in master.registry),
         storage="ok" if master.store.trouble is None else "the last change could not be stored",
@@ -47,8 +47,6 @@ async def healthz(request: Request, master: MasterDependency) -> HealthAnswer:
     response_class=Response,
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
 )
-async def metrics(request: Request) -> Response:
+async def metrics(services: MasterServicesDependency) -> Response:
     """All series of the master, as Prometheus text."""
-    found = request.app.state.metrics
-    assert isinstance(found, Metrics)
-    return Response(found.exposition(), media_type=CONTENT_TYPE_LATEST)
+    return Response(services.metrics.exposition(), media_type=CONTENT_TYPE_LATEST)

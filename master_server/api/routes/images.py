@@ -7,8 +7,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request, Response
 
-from master_server.api.image_requests import Pictures
-from master_server.api.routes.common import READERS, UNIT_ONLY, MasterDependency, body_of, ip_of
+from master_server.api.routes.common import READERS, UNIT_ONLY, MasterServicesDependency, body_of, ip_of
 from shared.clock import monotonic_ns
 from shared.messages import MAX_IMAGE_BYTES, PICTURE_RANGE_M, ImageKind
 
@@ -28,14 +27,14 @@ PNG = "image/png"
 async def image(
     unit_id: UnitId,
     kind: ImageKind,
-    request: Request,
+    services: MasterServicesDependency,
     raw: Annotated[bool, Query(description="16 bits in units of depth_scale instead of colours.")] = False,
 ) -> Response:
     """A picture (PNG) of the unit's next frame: what it measures, what it expects, or what remains of both.
 
     In colours near is red and far is blue, over the metres that the header `X-Depth-Range-M` names; black is nothing.
     """
-    png = await pictures_of(request).get(unit_id, kind, raw, monotonic_ns())
+    png = await services.pictures.get(unit_id, kind, raw, monotonic_ns())
     headers = {"Cache-Control": "no-store"}
     if not raw:
         headers["X-Depth-Range-M"] = "{:g} {:g}".format(*PICTURE_RANGE_M)
@@ -54,18 +53,11 @@ async def put_image(
     unit_id: UnitId,
     kind: ImageKind,
     request: Request,
-    master: MasterDependency,
+    services: MasterServicesDependency,
     command: Annotated[int, Query(ge=0, lt=2**63, description="Which it answers.")],
 ) -> None:
     """A unit sends the picture that it was asked for; of its own only."""
-    master.registry.own(unit_id, ip_of(request.scope))
-    pictures = pictures_of(request)
+    services.master.registry.own(unit_id, ip_of(request.scope))
+    pictures = services.pictures
     pictures.check_awaited(unit_id, command)
     pictures.deliver(unit_id, command, await body_of(request, MAX_IMAGE_BYTES))
-
-
-def pictures_of(request: Request) -> Pictures:
-    """The pictures that someone waits for."""
-    pictures = request.app.state.pictures
-    assert isinstance(pictures, Pictures)
-    return pictures

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Query, Request, Response
 
-from master_server.api.history import History, HistoryAnswer
+from master_server.api.history import HistoryAnswer
 from master_server.api.responses import (
     CoverageAnswer,
     Form,
@@ -23,6 +23,7 @@ from master_server.api.routes.common import (
     MasterDependency,
     Negotiated,
     ReadableDependency,
+    ServicesDependency,
     wants_msgpack,
 )
 from shared.clock import monotonic_ns
@@ -57,11 +58,9 @@ async def coverage(
 
 
 @router.get("/history", dependencies=READERS)
-async def history(request: Request) -> HistoryAnswer:
+async def history(services: ServicesDependency) -> HistoryAnswer:
     """The last five minutes, one sample a second: the scene refresh time, voxels, live units."""
-    kept = request.app.state.history
-    assert isinstance(kept, History)
-    return kept.answer(monotonic_ns())
+    return services.history.answer(monotonic_ns())
 
 
 @router.get("/settings", dependencies=READERS)

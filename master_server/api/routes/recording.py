@@ -5,26 +5,24 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Request
+from fastapi import APIRouter, Depends
 
-from master_server.api.routes.common import OPERATOR_ONLY, READERS, Negotiated
+from master_server.api.routes.common import OPERATOR_ONLY, READERS, Negotiated, ServicesDependency
 from master_server.recording.recorder import Recorder, RecordingStatus
 from shared.errors import Refusal
 
 router = APIRouter(tags=["recording"], route_class=Negotiated)
 
 
-async def recorder_of(request: Request) -> Recorder:
+async def recorder_of(services: ServicesDependency) -> Recorder:
     """The recorder of this application.
 
     Raises:
         Refusal: 409, it has none.
     """
-    recorder = request.app.state.recorder
-    if recorder is None:
+    if services.recorder is None:
         raise Refusal(409, "recording: there is nowhere to write to")
-    assert isinstance(recorder, Recorder)
-    return recorder
+    return services.recorder
 
 
 RecorderDependency = Annotated[Recorder, Depends(recorder_of)]

@@ -5,22 +5,21 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Request
+from fastapi import APIRouter, Depends
 from starlette.responses import JSONResponse
 from starlette.types import Receive, Scope, Send
 
-from master_server.api.routes.common import IS_REPLAY, OPERATOR_ONLY, READERS, Negotiated
+from master_server.api.routes.common import IS_REPLAY, OPERATOR_ONLY, READERS, Negotiated, ReadableDependency
 from master_server.recording.replay import Replay, ReplayAnswer, ReplayRequest
 from shared.clock import monotonic_ns
 
 router = APIRouter(tags=["replay"], route_class=Negotiated)
 
 
-async def replay_of(request: Request) -> Replay:
+async def replay_of(master: ReadableDependency) -> Replay:
     """The replay of this application."""
-    replay = request.app.state.master
-    assert isinstance(replay, Replay)
-    return replay
+    assert isinstance(master, Replay)
+    return master
 
 
 ReplayDependency = Annotated[Replay, Depends(replay_of)]

@@ -14,9 +14,9 @@ from typing import Literal
 from fastapi import APIRouter, WebSocket
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from master_server.api.map_stream import Listener, Stream, Wish
+from master_server.api.map_stream import Listener, Wish
 from master_server.api.responses import Form
-from master_server.api.routes.common import access_of, ip_of, log_refusal, refused, role_of
+from master_server.api.routes.common import access_of, ip_of, log_refusal, refused, role_of, stream_of
 from master_server.api.routes.sockets import serve
 from master_server.security.auth import ANYONE
 from shared.configuration import sentence
@@ -45,8 +45,7 @@ class StreamQuery(BaseModel):
 @router.websocket("/stream")
 async def stream(websocket: WebSocket) -> None:
     """The newest map at each change, as `StreamMessage`; who is slow skips."""
-    source = websocket.app.state.stream
-    assert isinstance(source, Stream)
+    source = stream_of(websocket)
     try:
         _refuse_token(websocket)
         access = access_of(websocket)

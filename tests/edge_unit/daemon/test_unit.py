@@ -24,6 +24,7 @@ from edge_unit.config import PoseConfig, UnitConfig
 from edge_unit.daemon import report as reporting_module
 from edge_unit.daemon import unit as unit_module
 from edge_unit.daemon.frame_processor import FrameWork
+from edge_unit.daemon.joint_lookup import FrameJoints
 from edge_unit.daemon.refinement_task import REFINE_FRAMES
 from edge_unit.daemon.unit import Unit
 from edge_unit.daemon.warm_up import rehearse
@@ -240,7 +241,9 @@ async def test_what_is_seen_goes_along_only_when_it_changed(tmp_path: Path) -> N
     update = MasterClient.update
 
     async def spy(client: MasterClient, request: Any) -> Any:
-        reports.append((request.health.frame, request.seen is not None))
+        # A heartbeat before the first frame is done tells of no frame, and of nothing that took time.
+        if request.health.process_ms > 0.0:
+            reports.append((request.health.frame, request.seen is not None))
         return await update(client, request)
 
     with pytest.MonkeyPatch.context() as monkey:
@@ -424,6 +427,40 @@ async def test_joints_whose_times_are_late_are_looked_up_later(tmp_path: Path, m
         assert await ahead() == pytest.approx(0.05, abs=0.02)
 
 
+async def test_no_frame_waits_for_the_look_at_the_joints_delay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = await asyncio.to_thread(Bench, tmp_path, with_robot=True)
+    looking, release, done = threading.Event(), threading.Event(), threading.Event()
+
+    def look() -> None:
+        looking.set()
+        assert release.wait(30.0)
+        done.set()
+
+    looks = iter([look])
+    monkeypatch.setattr(FrameJoints, "watch_delay", lambda *_: next(looks, None))
+
+    async def report(number: int) -> None:
+        """Show a frame and wait for its report."""
+        at_ns = monotonic_ns()
+        bench.master.put_joints(JointsRequest(positions=(0.0, 0.1), velocities=(0.0, 0.0), at_ns=at_ns), at_ns)
+        bench.show(patch(FAR_MM))
+        await bench.until(
+            lambda: (row := bench.row()) and row.arrival_age_s is not None and row.health.frame == number, "a report"
+        )
+
+    async with bench.running():
+        number = 0
+        while not looking.is_set():
+            # The first may come long after their joints, while kernels are compiled.
+            await report(number)
+            number += 1
+        for later in range(number, number + 3):
+            await report(later)
+        assert not done.is_set()
+        release.set()
+        await bench.until(done.is_set, "the look's end")
+
+
 async def test_joints_that_do_not_fit_are_a_trouble_and_no_end(tmp_path: Path) -> None:
     bench = await asyncio.to_thread(Bench, tmp_path, with_robot=True)
     bench.source.joints = np.zeros(3)
@@ -603,7 +640,7 @@ async def test_at_the_end_of_a_recording_the_last_frame_is_merged(tmp_path: Path
     assert last.sent
     assert last.merged_at_ns is not None
     assert 0 < last.merged_at_ns - last.captured_at_ns < 10**10
-    stages = ["source", "joints", "thread", "robot", "filter", "density", "check", "report"]
+    stages = ["source", "joints", "thread", "robot", "filter", "density", "seen", "health", "check", "report"]
     assert list(last.stages_ns) == stages
     assert all(took_ns >= 0 for took_ns in last.stages_ns.values())
     assert last.sent_at_ns is not None

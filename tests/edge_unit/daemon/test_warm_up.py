@@ -34,8 +34,6 @@ def first_frame() -> None:
     pipeline = DepthPipeline(camera(), look_at((2.0, 0.0, 1.5), (0.0, 0.0, 0.0)), cell)
     assert cell.robot is not None
     pipeline.process(np.full((240, 424), 1500, np.uint16), np.zeros(cell.robot.joint_count))
-    pipeline.health()
-    pipeline.seen()
 
 
 def test_the_first_frame_needs_no_kernel_that_was_not_rehearsed() -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import yaml
 from numpy.typing import NDArray
 
 from edge_unit.__main__ import main
-from edge_unit.joints import DelayLook, DelayWatch, JointHistory, estimate_delay, look_at
+from edge_unit.joints import DelayEstimate, DelayLook, DelayWatch, JointHistory, delay_monitor, estimate_delay, look_at
 from edge_unit.joints.delay_estimation import LOOKS_MIN
 from edge_unit.joints.delay_from_recording import JointSamples
 from edge_unit.joints.delay_monitor import PERIOD_NS
@@ -93,14 +94,14 @@ def test_a_running_unit_warns_of_a_delay_that_is_off(pipeline: DepthPipeline, fr
         assert watch.due(at_ns)
         watch.keep(pipeline, depth, at_ns)
         assert not watch.due(at_ns + PERIOD_NS // 2)
-        assert watch.joints(history) is None
+        assert watch.next_look(history) is None
         for step in range(round(PERIOD_NS / NS_PER_S / 0.008)):
             t_s = frame_s * slow + 0.008 * step - 0.1
             late_ns = began_ns + round((t_s + 0.06) * NS_PER_S)
             history.add([JointSample(late_ns, tuple(path.joints_at(t_s).tolist()), None)])
-        joints = watch.joints(history)
-        if joints is not None:
-            watch.look(joints)
+        look = watch.next_look(history)
+        if look is not None:
+            look()
         told.append(watch.warning(0.0))
     assert told[: LOOKS_MIN - 1] == [None] * (LOOKS_MIN - 1)
     assert told[-1] is not None
@@ -110,6 +111,56 @@ def test_a_running_unit_warns_of_a_delay_that_is_off(pipeline: DepthPipeline, fr
     assert earlier is not None
     assert "earlier" in earlier
     assert len(told[-1]) < 200
+
+
+def test_looks_come_one_by_one_and_those_of_another_background_do_not_count(
+    world: World, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipeline = DepthPipeline(INTRINSICS, POSE, world.cell)
+    monkeypatch.setattr(delay_monitor, "estimate_delay", lambda misfits: DelayEstimate(1.0, 0.0, len(misfits)))
+    watch, history = DelayWatch(), JointHistory()
+    depth, frame_s = frames[3]
+    for step in range(150):
+        t_s = frame_s - 0.2 + 0.008 * step
+        history.add([JointSample(NS_PER_S + round(t_s * NS_PER_S), tuple(PATH.joints_at(t_s).tolist()), None)])
+
+    def kept_look() -> Callable[[], None] | None:
+        watch.keep(pipeline, depth, NS_PER_S + round(frame_s * NS_PER_S))
+        return watch.next_look(history)
+
+    first = kept_look()
+    assert first is not None
+    assert watch.next_look(history) is None
+    # Until it is done there is no other, and a frame that is kept meanwhile waits for it.
+    assert kept_look() is None
+    first()
+    assert watch.warning(0.0) is not None
+    second = watch.next_look(history)
+    assert second is not None
+    pipeline.move(camera_at((0.9, 0.1, 1.2), (0.25, 0.0, 0.2)))
+    watch.keep(pipeline, depth, NS_PER_S + round(frame_s * NS_PER_S))
+    second()
+    assert watch.warning(0.0) is None
+    third = watch.next_look(history)
+    assert third is not None
+    third()
+    assert watch.warning(0.0) is not None
+
+
+def test_a_frame_that_is_kept_is_a_copy(pipeline: DepthPipeline, frames: list[Frame]) -> None:
+    """The source uses its memory again, and the pipeline goes on while the look is taken."""
+    depth, frame_s = frames[3]
+    robot = pipeline.cell.robot
+    assert robot is not None
+    static_m = pipeline.expected_depth(None)
+    look = DelayLook(INTRINSICS, POSE, robot, static_m, FilterSettings())
+    joints = [PATH.joints_at(frame_s)]
+    before = depth.copy()
+    thinned_m = look.thinned(before)
+    expected = look.misfits(thinned_m, joints)
+    before[:] = 0
+    static_m[:] = 0.0
+    np.testing.assert_array_equal(look.misfits(thinned_m, joints), expected)
 
 
 def test_a_recording_tells_its_delay(frames: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

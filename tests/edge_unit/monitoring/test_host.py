@@ -3,7 +3,12 @@
 
 from __future__ import annotations
 
+import ctypes
+import struct
 from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
 
 from edge_unit.monitoring import clock_is_set, usb_cameras
 
@@ -25,5 +30,26 @@ def test_cameras_on_usb_with_their_speed(tmp_path: Path) -> None:
     assert usb_cameras(tmp_path) == [f"{camera} at 480 Mbit/s", f"{camera} at 5000 Mbit/s"]
 
 
+TIME_ERROR = 5
+"""What adjtimex(2) returns of a clock that nobody keeps right, whatever its structure says; less is right."""
+
+
 def test_the_kernel_knows_whether_its_clock_is_set() -> None:
-    assert clock_is_set() in (True, False)
+    told = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512))
+    assert clock_is_set() == (0 <= told < TIME_ERROR)
+
+
+@pytest.mark.parametrize(
+    ("returned", "status", "expected"),
+    [(0, 0x0001, True), (0, 0x2001, True), (5, 0x0040, False), (5, 0x2041, False), (-1, 0, False)],
+)
+def test_a_clock_is_set_unless_it_is_unsynchronised(
+    returned: int, status: int, expected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def adjtimex(timex: ctypes.Array[ctypes.c_char]) -> int:
+        # modes, offset, freq, maxerror, esterror and status, as 64-bit Linux aligns them.
+        struct.pack_into("=I4xqqqqi", timex, 0, 0, 0, 0, 0, 0, status)
+        return returned
+
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: SimpleNamespace(adjtimex=adjtimex))
+    assert clock_is_set() == expected

@@ -47,8 +47,8 @@ class Watched:
             frame = eye.capture(self.t_s)
             depth = frame.depth.copy()
             depth[:, round(share * EYE.width) :] = 0
-            self.pipeline.process(depth, frame.joints)
-            yield self.stance.judge(self.pipeline.misfit(), self.pipeline.static_version, round(self.t_s * 1e9))
+            self.misfit = self.pipeline.process(depth, frame.joints, with_misfit=True).misfit
+            yield self.stance.watch(self.misfit, self.pipeline.static_version, round(self.t_s * 1e9))
             self.stance.save()
             self.t_s += PERIOD_S
 
@@ -149,7 +149,10 @@ def test_without_known_surfaces_nothing_is_told(watched: Watched) -> None:
 
 
 def misfit_of(watched: Watched) -> Misfit:
-    return watched.pipeline.misfit()
+    """That of a frame in which nothing is out of place."""
+    list(watched.looks(1))
+    assert watched.misfit is not None
+    return watched.misfit
 
 
 def test_looks_are_due_again_after_a_while_and_when_time_begins_anew(tmp_path: Path) -> None:

@@ -61,15 +61,15 @@ def pipeline(robot: bool = True) -> DepthPipeline:
 def test_what_was_learned_is_no_obstacle_and_what_comes_after_is() -> None:
     empty = pipeline(robot=False)
     rng = np.random.default_rng(0)
-    assert len(empty.process(look(), None)) > 10
+    assert len(empty.process(look(), None).voxels) > 10
     reference = empty.learn((look(noise=rng), None) for _ in range(20))
     assert reference.frames == 20
     assert reference.learned_share > 0.99
     empty.use(reference)
-    assert len(empty.process(look(noise=rng), None)) == 0
-    assert len(empty.process(look(PERSON, noise=rng), None)) > 10
+    assert len(empty.process(look(noise=rng), None).voxels) == 0
+    assert len(empty.process(look(PERSON, noise=rng), None).voxels) > 10
     empty.use(None)
-    assert len(empty.process(look(noise=rng), None)) > 10
+    assert len(empty.process(look(noise=rng), None).voxels) > 10
 
 
 def test_the_expected_depth_is_the_learned_one() -> None:
@@ -94,7 +94,7 @@ def test_who_crosses_while_it_learns_is_still_reported() -> None:
     person = (look(PERSON) < look()) & shrunk(look(PERSON) < look(), 2)
     assert person.sum() > 200
     assert empty.foreground(look(PERSON, noise=rng), None)[person].mean() > 0.99
-    assert len(empty.process(look(noise=rng), None)) == 0
+    assert len(empty.process(look(noise=rng), None).voxels) == 0
 
 
 def test_who_crosses_where_nothing_is_measured_is_still_reported() -> None:
@@ -135,7 +135,7 @@ def test_the_fixed_base_leaves_no_unlearned_ring() -> None:
     assert np.isfinite(reference.depth_m[ring]).mean() > 0.97
     watched.use(reference)
     assert not watched.foreground(look(joints=-2.5), [-2.5])[ring].any()
-    assert len(watched.process(look(joints=-2.5), [-2.5])) == 0
+    assert len(watched.process(look(joints=-2.5), [-2.5]).voxels) == 0
 
 
 def test_the_robot_is_not_learned() -> None:
@@ -178,10 +178,10 @@ def test_it_is_void_when_the_camera_moved_and_kept_when_its_pose_is_refined() ->
     nudged = look_at((0.3, -0.2, 1.752), (0.1, 0.0, 0.0))
     empty.move(nudged, refined=True)
     assert empty.reference is reference
-    assert len(empty.process(look(), None)) == 0
+    assert len(empty.process(look(), None).voxels) == 0
     empty.move(nudged)
     assert empty.reference is None
-    assert len(empty.process(look(), None)) > 10
+    assert len(empty.process(look(), None).voxels) > 10
 
 
 def test_it_outlives_new_settings_and_a_new_cell() -> None:
@@ -189,10 +189,10 @@ def test_it_outlives_new_settings_and_a_new_cell() -> None:
     reference = empty.learn([(look(), None)])
     empty.use(reference)
     empty.apply(empty.settings.model_copy(update={"voxel_size_m": 0.1}))
-    assert len(empty.process(look(), None)) == 0
+    assert len(empty.process(look(), None).voxels) == 0
     empty.use_cell(small_cell(robot=False))
     assert empty.reference is reference
-    assert len(empty.process(look(), None)) == 0
+    assert len(empty.process(look(), None).voxels) == 0
 
 
 def test_one_of_another_resolution_is_refused() -> None:

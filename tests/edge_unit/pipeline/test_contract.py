@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The contract's calls run as others write them, on the demo cell."""
+"""The Python block of the design's contract runs as it stands, on the demo cell."""
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,19 @@ from shared.cell import Cell
 from shared.lattice import Lattice
 from shared.meshes import cylinder_mesh
 from shared.settings import FilterSettings
-from tests.edge_unit.scenes import ABOVE_TABLE, CHECKOUT, HOME_RAD, bodies, camera, demo_cell, measured, placed, raycast
+from tests.edge_unit.scenes import (
+    ABOVE_TABLE,
+    CHECKOUT,
+    HOME_RAD,
+    bodies,
+    camera,
+    demo_cell,
+    measured,
+    placed,
+    raycast,
+)
+
+DESIGN = CHECKOUT.parent / "shared" / "DESIGN.md"
 
 BLOCK = """
 from shared.camera import Intrinsics
@@ -23,13 +36,25 @@ from shared.cell import Cell
 from edge_unit.pipeline import DepthPipeline
 
 pipeline = DepthPipeline(intrinsics, T_world_camera, cell, settings)
-voxels = pipeline.process(depth, joints)
-voxels.indices
+result = pipeline.process(depth, joints)
+voxels = result.voxels
+result.seen, result.health, result.times
 pipeline.expected_depth(joints)
 pipeline.foreground(depth, joints)
 reference = pipeline.learn(frames)
 pipeline.use(reference)
 """
+
+
+def blocks() -> list[Any]:
+    """Our copy, and the design's own block where the design lies beside the checkout."""
+    found = [pytest.param(BLOCK, id="copy")]
+    if DESIGN.is_file():
+        contract = DESIGN.read_text().split("## The contract", 1)[1]
+        written = re.search(r"```python\n(.*?)```", contract, re.DOTALL)
+        assert written is not None
+        found.append(pytest.param(written.group(1), id="design"))
+    return found
 
 
 def what_it_is_given(joints: Any) -> dict[str, Any]:
@@ -49,9 +74,10 @@ def what_it_is_given(joints: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("joints", [HOME_RAD, HOME_RAD.tolist(), None], ids=["array", "list", "none"])
-def test_the_block_runs_as_it_stands(joints: Any) -> None:
+@pytest.mark.parametrize("block", blocks())
+def test_the_block_runs_as_it_stands(block: str, joints: Any) -> None:
     names = what_it_is_given(joints)
-    exec(compile(BLOCK, "contract", "exec"), names)
+    exec(compile(block, "contract", "exec"), names)
     voxels, pipeline, shape = names["voxels"], names["pipeline"], names["intrinsics"].shape
 
     assert voxels.indices.dtype == np.int16

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from edge_unit.pipeline import DepthPipeline
+from edge_unit.pipeline import DepthPipeline, moving_model
 from edge_unit.pipeline import depth_pipeline as pipeline_module
 from shared.camera import Intrinsics
 from shared.cell import Cell
@@ -70,13 +70,13 @@ def test_what_is_known_is_no_obstacle() -> None:
     rng = np.random.default_rng(0)
     watched = pipeline()
     for joints in np.linspace(-3.0, 3.0, 12):
-        assert len(watched.process(look(joints=joints, noise=rng), [joints])) == 0
+        assert len(watched.process(look(joints=joints, noise=rng), [joints]).voxels) == 0
 
 
 def test_what_is_not_known_is_reported_where_it_stands() -> None:
     watched = pipeline()
     depth = look(PERSON)
-    voxels = watched.process(depth, [0.3])
+    voxels = watched.process(depth, [0.3]).voxels
     assert len(voxels) > 20
     centres_m = voxels.lattice.centres(voxels.indices)
     from_axis_m = np.hypot(centres_m[:, 0] + 0.3, centres_m[:, 1] - 0.4)
@@ -90,7 +90,7 @@ def test_foreground_is_what_process_counts() -> None:
     mask = watched.foreground(depth, [0.3])
     assert mask.dtype == np.bool_
     assert mask.shape == CAMERA.shape
-    voxels = watched.process(depth, [0.3])
+    voxels = watched.process(depth, [0.3]).voxels
     assert 0 < voxels.counts.sum() <= mask.sum()
 
 
@@ -98,9 +98,10 @@ def test_depth_0_is_neither_obstacle_nor_free() -> None:
     watched = pipeline()
     nothing = np.zeros(CAMERA.shape, np.uint16)
     assert not watched.foreground(nothing, [0.3]).any()
-    assert len(watched.process(nothing, [0.3])) == 0
-    assert not watched.seen().seen.any()
-    assert watched.health().valid_share == 0.0
+    result = watched.process(nothing, [0.3])
+    assert len(result.voxels) == 0
+    assert not result.seen.seen.any()
+    assert result.health.valid_share == 0.0
 
 
 def test_measurements_out_of_range_are_ignored() -> None:
@@ -128,7 +129,7 @@ def test_known_edges_have_a_halo_and_no_more() -> None:
 
     assert (wider(4) != wider(0)).sum() > 300
     assert not watched.foreground(wider(4), None).any()
-    assert len(watched.process(wider(20), None)) > 5
+    assert len(watched.process(wider(20), None).voxels) > 5
 
 
 # ---------------------------------------------------------------- the robot
@@ -141,7 +142,7 @@ def test_the_robot_is_filtered_wherever_it_is_and_reported_elsewhere() -> None:
     assert arm.sum() > 40
     assert not watched.foreground(look(joints=0.3), [0.3])[arm].any()
     assert watched.foreground(look(joints=0.3), [2.3])[arm].mean() > 0.8
-    assert len(watched.process(look(joints=0.3), [2.3])) > 3
+    assert len(watched.process(look(joints=0.3), [2.3]).voxels) > 3
 
 
 def test_without_joints_the_robot_is_reported() -> None:
@@ -150,8 +151,8 @@ def test_without_joints_the_robot_is_reported() -> None:
     depth = look()
     assert not watched.foreground(depth, [0.3])[robot].any()
     assert watched.foreground(depth, None)[robot].mean() > 0.95
-    assert len(watched.process(depth, None)) > 10
-    assert len(watched.process(depth, [0.3])) == 0
+    assert len(watched.process(depth, None).voxels) > 10
+    assert len(watched.process(depth, [0.3]).voxels) == 0
     assert np.isfinite(watched.expected_depth([0.3])).sum() >= np.isfinite(watched.expected_depth(None)).sum()
     assert (watched.expected_depth([0.3]) < watched.expected_depth(None)).any()
 
@@ -167,7 +168,7 @@ def test_the_robot_is_two_sided() -> None:
     foreground = watched.foreground(measured(wall_m, CAMERA), [0.3])
     # Where the line of sight grazes a side, the side lies far behind the padded edge that it enters by.
     assert foreground[robot].mean() < 0.03
-    assert len(watched.process(measured(robot_m, CAMERA), [0.3])) == 0
+    assert len(watched.process(measured(robot_m, CAMERA), [0.3]).voxels) == 0
     assert foreground[~robot].mean() > 0.999
     # 30 mm of halo: at 1.35 m not quite 5 px.
     nearest_m = ndimage.minimum_filter(robot_m, 9)
@@ -205,8 +206,8 @@ def test_an_arm_that_is_not_where_it_should_be_is_covered_by_its_uncertainty() -
     watched = pipeline()
     off_rad = 0.25
     depth = look(joints=0.3 + off_rad)
-    assert len(watched.process(depth, [0.3])) > 0
-    assert len(watched.process(depth, [0.3], joint_uncertainty_rad=off_rad)) == 0
+    assert len(watched.process(depth, [0.3]).voxels) > 0
+    assert len(watched.process(depth, [0.3], joint_uncertainty_rad=off_rad).voxels) == 0
 
 
 def test_a_link_close_to_the_camera_is_filtered() -> None:
@@ -225,7 +226,7 @@ def test_a_link_close_to_the_camera_is_filtered() -> None:
 def test_a_cell_without_a_robot_takes_no_joints() -> None:
     watched = pipeline(small_cell(robot=False))
     depth = measured(raycast(bodies(small_cell(robot=False), None), OVERHEAD, CAMERA), CAMERA)
-    assert len(watched.process(depth, None)) == 0
+    assert len(watched.process(depth, None).voxels) == 0
     assert (watched.expected_depth(None) == watched.expected_depth(None)).all()
 
 
@@ -247,7 +248,7 @@ def test_the_voxel_size_changes_while_it_runs() -> None:
     numbers = []
     for size_m in (0.05, 0.1, 0.02, 0.01, 0.05):
         watched.apply(watched.settings.model_copy(update={"voxel_size_m": size_m}))
-        voxels = watched.process(depth, [0.3])
+        voxels = watched.process(depth, [0.3]).voxels
         assert watched.lattice == voxels.lattice == small_cell().lattice(size_m)
         centres_m = voxels.lattice.centres(voxels.indices)
         assert np.hypot(centres_m[:, 0] + 0.3, centres_m[:, 1] - 0.4).max() < 0.12 + size_m
@@ -262,12 +263,12 @@ def test_voxels_are_cropped_to_the_box() -> None:
     cropped = replace(cell, box_min_m=np.array((-0.3, -1.0, 0.1)), box_max_m=np.array((1.0, 0.4, 1.0)))
     watched = DepthPipeline(CAMERA, OVERHEAD, cropped)
     depth = measured(raycast([*bodies(cell, None), PERSON], OVERHEAD, CAMERA), CAMERA)
-    voxels = watched.process(depth, None)
+    voxels = watched.process(depth, None).voxels
     assert len(voxels) > 3
     centres_m = voxels.lattice.centres(voxels.indices)
     assert (centres_m > cropped.box_min_m).all()
     assert (centres_m < cropped.box_max_m + voxels.lattice.voxel_size_m).all()
-    assert len(DepthPipeline(CAMERA, OVERHEAD, cell).process(depth, None)) > len(voxels)
+    assert len(DepthPipeline(CAMERA, OVERHEAD, cell).process(depth, None).voxels) > len(voxels)
 
 
 def test_settings_take_effect_with_the_next_frame() -> None:
@@ -285,39 +286,40 @@ def test_settings_take_effect_with_the_next_frame() -> None:
 def test_a_finer_lattice_than_fits_is_refused_and_the_old_one_stays() -> None:
     hall = replace(small_cell(), box_min_m=np.full(3, -10.0), box_max_m=np.full(3, 10.0))
     watched = pipeline(hall)
-    before = watched.process(look(PERSON), [0.3])
+    before = watched.process(look(PERSON), [0.3]).voxels
     with pytest.raises(InputError, match="2000 x 2000 x 2000"):
         watched.apply(FilterSettings(voxel_size_m=0.01))
     assert watched.settings == FilterSettings()
-    assert (watched.process(look(PERSON), [0.3]).keys == before.keys).all()
+    assert (watched.process(look(PERSON), [0.3]).voxels.keys == before.keys).all()
 
 
 def test_a_cell_whose_lattice_does_not_fit_is_refused_and_the_old_one_stays() -> None:
     watched = pipeline()
-    before, cell = watched.process(look(PERSON), [0.3]), watched.cell
+    before, cell = watched.process(look(PERSON), [0.3]).voxels, watched.cell
     with pytest.raises(InputError, match="at most 134217728"):
         watched.use_cell(replace(small_cell(), box_max_m=np.full(3, 100.0)))
     assert watched.cell is cell
-    assert (watched.process(look(PERSON), [0.3]).keys == before.keys).all()
+    assert (watched.process(look(PERSON), [0.3]).voxels.keys == before.keys).all()
 
 
 def test_a_large_cell_works() -> None:
     """30 m of hall in voxels of 10 cm: its seen blocks are larger."""
     hall = replace(small_cell(), box_min_m=np.full(3, -15.0), box_max_m=np.full(3, 15.0))
     watched = pipeline(hall, voxel_size_m=0.1, seen_block_size_m=0.05)
-    assert len(watched.process(look(PERSON), [0.3])) > 0
-    assert watched.seen().lattice.voxel_size_m == pytest.approx(0.8)
+    result = watched.process(look(PERSON), [0.3])
+    assert len(result.voxels) > 0
+    assert result.seen.lattice.voxel_size_m == pytest.approx(0.8)
 
 
 def test_an_object_that_moved_is_known_at_its_new_place() -> None:
     watched, cell = pipeline(), small_cell()
     moved = cell.with_object_pose("crate", from_xyz_rpy((0.5, -0.4, 0.2), (0, 0, 0.7)))
     old, new = look(cell=cell), look(cell=moved)
-    assert len(watched.process(old, [0.3])) == 0
-    assert len(watched.process(new, [0.3])) > 0
+    assert len(watched.process(old, [0.3]).voxels) == 0
+    assert len(watched.process(new, [0.3]).voxels) > 0
     watched.use_cell(moved)
-    assert len(watched.process(new, [0.3])) == 0
-    assert len(watched.process(old, [0.3])) > 0
+    assert len(watched.process(new, [0.3]).voxels) == 0
+    assert len(watched.process(old, [0.3]).voxels) > 0
     assert (watched.expected_depth([0.3]) != pipeline().expected_depth([0.3])).any()
 
 
@@ -325,33 +327,40 @@ def test_an_object_that_moves_leaves_the_robot_as_it_is(monkeypatch: pytest.Monk
     cell = small_cell()
     watched = pipeline(cell)
     watched.process(look(PERSON), [0.3])
-    for name in ("RobotLayer", "BareRobot", "Voxelizer", "Visibility"):
-        monkeypatch.setattr(pipeline_module, name, None)
+    for module, name in (
+        (moving_model, "RobotLayer"),
+        (moving_model, "BareRobot"),
+        (pipeline_module, "Voxelizer"),
+        (pipeline_module, "Visibility"),
+    ):
+        monkeypatch.setattr(module, name, None)
     moved = cell.with_object_pose("crate", from_xyz_rpy((0.5, -0.4, 0.2), (0, 0, 0.7)))
     watched.use_cell(moved)
     monkeypatch.undo()
     fresh = pipeline(moved)
     depth = look(PERSON, cell=moved)
-    assert (watched.process(depth, [0.3]).keys == fresh.process(depth, [0.3]).keys).all()
+    found, wanted = watched.process(depth, [0.3]), fresh.process(depth, [0.3])
+    assert (found.voxels.keys == wanted.voxels.keys).all()
     assert (watched.expected_depth([0.3]) == fresh.expected_depth([0.3])).all()
-    assert (watched.seen().seen == fresh.seen().seen).all()
+    assert (found.seen.seen == wanted.seen.seen).all()
 
 
 def test_cell_and_settings_are_adopted_together_or_not_at_all() -> None:
     # Too large for the settings before, so that one after the other would not do.
     hall = replace(small_cell(), box_min_m=np.full(3, -15.0), box_max_m=np.full(3, 15.0))
     watched = pipeline()
-    cell, before = watched.cell, watched.process(look(PERSON), [0.3])
+    cell, before = watched.cell, watched.process(look(PERSON), [0.3]).voxels
     for voxel_size_m in (0.05, 0.04):
         with pytest.raises(InputError, match="choose larger voxels"):
             watched.adopt(hall, FilterSettings(voxel_size_m=voxel_size_m))
         assert (watched.cell, watched.settings) == (cell, FilterSettings())
-        assert (watched.process(look(PERSON), [0.3]).keys == before.keys).all()
+        assert (watched.process(look(PERSON), [0.3]).voxels.keys == before.keys).all()
     watched.adopt(hall, FilterSettings(voxel_size_m=0.1, robot_padding_m=0.08))
     fresh = pipeline(hall, voxel_size_m=0.1, robot_padding_m=0.08)
     assert watched.lattice == fresh.lattice
-    assert (watched.process(look(PERSON), [0.3]).keys == fresh.process(look(PERSON), [0.3]).keys).all()
-    assert (watched.seen().seen == fresh.seen().seen).all()
+    found, wanted = watched.process(look(PERSON), [0.3]), fresh.process(look(PERSON), [0.3])
+    assert (found.voxels.keys == wanted.voxels.keys).all()
+    assert (found.seen.seen == wanted.seen.seen).all()
 
 
 def test_another_pose_of_the_camera() -> None:
@@ -362,10 +371,11 @@ def test_another_pose_of_the_camera() -> None:
     moved.process(look(), [0.3])
     moved.move(there)
     fresh = DepthPipeline(CAMERA, there, small_cell())
-    assert (moved.process(depth, [0.3]).keys == fresh.process(depth, [0.3]).keys).all()
+    found, wanted = moved.process(depth, [0.3]), fresh.process(depth, [0.3])
+    assert (found.voxels.keys == wanted.voxels.keys).all()
     assert (moved.expected_depth([0.3]) == fresh.expected_depth([0.3])).all()
-    assert (moved.seen().seen == fresh.seen().seen).all()
-    assert moved.health() == fresh.health()
+    assert (found.seen.seen == wanted.seen.seen).all()
+    assert found.health == wanted.health
 
 
 def test_another_cell() -> None:
@@ -376,62 +386,68 @@ def test_another_cell() -> None:
     changed.use_cell(cell)
     fresh = pipeline(cell)
     depth = look()
-    assert (changed.process(depth, None).keys == fresh.process(depth, None).keys).all()
+    assert (changed.process(depth, None).voxels.keys == fresh.process(depth, None).voxels.keys).all()
     assert (changed.expected_depth(None) == fresh.expected_depth(None)).all()
     changed.use_cell(small_cell())
-    assert len(changed.process(depth, [0.3])) == 0
+    assert len(changed.process(depth, [0.3]).voxels) == 0
 
 
-@pytest.mark.parametrize("change", ["apply", "move", "use_cell"])
-def test_nothing_is_seen_before_the_first_frame_after_a_change(change: str) -> None:
-    """The last frame was taken of another place, or filtered by other rules."""
-    watched = pipeline()
-    assert not watched.seen().seen.any()
-    watched.process(look(), [0.3])
-    assert watched.seen().seen.any()
-    if change == "apply":
-        watched.apply(watched.settings)
+@pytest.mark.parametrize("change", ["next frame", "source", "apply", "move", "use_cell", "use"])
+def test_a_result_stays_what_it_was(change: str) -> None:
+    """Neither later frames nor changes, nor a source that reuses its memory, reach into it."""
+    watched, depth = pipeline(), look(PERSON)
+    result = watched.process(depth, [0.3], with_misfit=True)
+    assert result.misfit is not None
+    values = (result.voxels.keys, result.voxels.counts, result.seen.seen, result.misfit.slope)
+    before = [value.copy() for value in values]
+    if change == "next frame":
+        watched.process(look(), [0.5], with_misfit=True)
+    elif change == "source":
+        depth[:] = 0
+    elif change == "apply":
+        watched.apply(FilterSettings(voxel_size_m=0.1))
     elif change == "move":
-        watched.move(OVERHEAD)
+        watched.move(look_at((-0.5, -0.6, 1.6), (0.0, 0.0, 0.1)))
+    elif change == "use_cell":
+        watched.use_cell(replace(small_cell(), objects=()))
     else:
-        watched.use_cell(small_cell())
-    assert not watched.seen().seen.any()
-    watched.process(look(), [0.3])
-    assert watched.seen().seen.any()
+        watched.use(watched.learn([(look(), [0.3])]))
+    for value, old in zip(values, before, strict=True):
+        assert (value == old).all()
 
 
 def test_what_the_robot_hides_is_not_seen() -> None:
     """Neither behind it nor within its padding; without joints it is an obstacle and hides as such."""
     watched = pipeline()
-    watched.process(look(), [0.3])
-    seen = watched.seen()
+    seen = watched.process(look(), [0.3]).seen
     keys = np.nonzero(seen.seen)[0]
     assert len(keys) > 100
     low_m = np.array(seen.lattice.origin_m) + seen.lattice.indices(keys) * seen.lattice.voxel_size_m
     column = (np.abs(low_m[:, :2] + 0.05) < 0.11).all(axis=1) & (low_m[:, 2] < 0.4)
     assert not column.any()
-    watched.process(look(), None)
-    assert watched.seen().seen.sum() > 100
+    assert watched.process(look(), None).seen.seen.sum() > 100
 
 
 def test_what_a_halo_may_hide_is_not_seen() -> None:
     """Beside the crate, at its own depth, nothing would be reported."""
     haloed, plain = pipeline(), pipeline(static_padding_m=0.0)
-    for watched in (haloed, plain):
-        watched.process(look(), [0.3])
-    with_halo, without = haloed.seen().seen, plain.seen().seen
+    with_halo, without = (watched.process(look(), [0.3]).seen.seen for watched in (haloed, plain))
     assert not (with_halo & ~without).any()
     assert with_halo.sum() < without.sum()
 
 
-def test_stage_times_are_those_of_the_last_frame() -> None:
+def test_a_frame_tells_how_long_each_stage_took() -> None:
     watched = pipeline()
-    assert watched.last.total_ns == 0
-    watched.process(look(), [0.3])
-    times = watched.last
-    parts = (times.expected_ns, times.points_ns, times.voxels_ns)
-    assert min(parts) >= 0
-    assert sum(parts) == times.total_ns > 0
+    times = watched.process(look(), [0.3]).times
+    parts = (times.expected_ns, times.foreground_ns, times.density_ns, times.seen_ns, times.health_ns)
+    assert min(parts) > 0
+    assert times.misfit_ns == 0
+    assert sum(parts) == times.total_ns
+    assert watched.process(look(), [0.3], with_misfit=True).times.misfit_ns > 0
+
+
+def test_misfit_is_told_where_it_is_asked_for() -> None:
+    assert pipeline().process(look(), [0.3]).misfit is None
 
 
 # ---------------------------------------------------------------- input
@@ -441,7 +457,7 @@ def test_stage_times_are_those_of_the_last_frame() -> None:
 def test_depth_in_any_memory_order_is_the_same_frame(order: str) -> None:
     watched = pipeline()
     depth = look(PERSON)
-    wanted = watched.process(depth, [0.3])
+    wanted = watched.process(depth, [0.3]).voxels
     if order == "flipped":
         other = depth[::-1, ::-1].copy()[::-1, ::-1]
     elif order == "cropped":
@@ -450,7 +466,7 @@ def test_depth_in_any_memory_order_is_the_same_frame(order: str) -> None:
         other = np.asfortranarray(depth)
     else:
         other = np.frombuffer(depth.tobytes(), np.uint16).reshape(depth.shape)
-    voxels = watched.process(other, [0.3])
+    voxels = watched.process(other, [0.3]).voxels
     assert (voxels.keys == wanted.keys).all()
     assert (voxels.counts == wanted.counts).all()
 
@@ -459,9 +475,7 @@ def test_a_frame_is_left_as_it_was() -> None:
     depth = look(PERSON)
     copy = depth.copy()
     watched = pipeline()
-    watched.process(depth, [0.3])
-    watched.seen()
-    watched.health()
+    watched.process(depth, [0.3], with_misfit=True)
     assert (depth == copy).all()
 
 
@@ -517,8 +531,8 @@ def working() -> DepthPipeline:
 
 
 def still_works(watched: DepthPipeline) -> bool:
-    wanted = pipeline().process(GOOD, [0.3])
-    found = watched.process(GOOD, [0.3])
+    wanted = pipeline().process(GOOD, [0.3]).voxels
+    found = watched.process(GOOD, [0.3]).voxels
     return len(found) > 0 and np.array_equal(found.keys, wanted.keys) and np.array_equal(found.counts, wanted.counts)
 
 
@@ -645,7 +659,7 @@ def test_a_frame_allocates_nothing_that_grows_with_it() -> None:
     intrinsics = camera(1280, 720)
     watched, depth = DepthPipeline(intrinsics, ABOVE_TABLE, demo_cell()), demo_frame(intrinsics)
     process_moving(watched, depth, 0, 5)
-    assert len(watched.process(depth, HOME_RAD)) > 50
+    assert len(watched.process(depth, HOME_RAD).voxels) > 50
     tracemalloc.start()
     process_moving(watched, depth, 5, 5)
     peak = tracemalloc.get_traced_memory()[1]
@@ -675,7 +689,7 @@ def test_the_marks_on_real_frames(data_dir: Path) -> None:
         window = (u >= 325) & (u <= 490) & (v >= 285) & (v <= 600)
         second = window & (depth[i] >= 1450) & (depth[i] <= 1850) & ~masks[i]
         miss = 100.0 * (second & ~foreground).sum() / second.sum()
-        voxels = watched.process(depth[i], joints[i])
+        voxels = watched.process(depth[i], joints[i]).voxels
         points_m = voxels.lattice.centres(voxels.indices) - T_world_camera[:3, 3]
         points_m = points_m @ T_world_camera[:3, :3]
         x, y = intrinsics.project(points_m).T
@@ -718,4 +732,4 @@ def test_links_that_point_at_a_camera_above_them_are_still_robot() -> None:
     eye = SimulatedCamera(world, above, intrinsics, renderer="raycast", seed=3)
     pipeline = DepthPipeline(intrinsics, above, demo_cell())
     frames = [eye.capture(0.69 * n) for n in range(16)]
-    assert [len(pipeline.process(frame.depth, frame.joints)) for frame in frames] == [0] * len(frames)
+    assert [len(pipeline.process(frame.depth, frame.joints).voxels) for frame in frames] == [0] * len(frames)

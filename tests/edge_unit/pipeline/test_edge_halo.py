@@ -39,8 +39,8 @@ def scene(grown_px: int = 0) -> NDArray[np.uint16]:
 def test_the_halo_of_a_known_edge_is_not_reported() -> None:
     """A frame 35 mm wide, at the block's own depth, all around it."""
     grown = scene(grown_px=7)
-    assert len(pipeline(static_padding_m=0.0).process(grown, None)) > 0
-    assert len(pipeline().process(grown, None)) == 0
+    assert len(pipeline(static_padding_m=0.0).process(grown, None).voxels) > 0
+    assert len(pipeline().process(grown, None).voxels) == 0
     assert not pipeline().foreground(grown, None).any()
 
 
@@ -52,7 +52,7 @@ def test_what_stands_beside_an_edge_deeper_or_nearer_is_seen() -> None:
         depth[beside] = depth_mm
         watched = pipeline()
         assert watched.foreground(depth, None)[beside].all()
-        assert len(watched.process(depth, None)) > 0
+        assert len(watched.process(depth, None).voxels) > 0
 
 
 def test_what_a_halo_could_hide_is_not_called_seen() -> None:
@@ -60,8 +60,7 @@ def test_what_a_halo_could_hide_is_not_called_seen() -> None:
     heights = (-0.65, -1.05)
     seen = []
     for watched in (pipeline(), pipeline(static_padding_m=0.0)):
-        watched.process(scene(), None)
-        blocks = watched.seen()
+        blocks = watched.process(scene(), None).seen
         at = blocks.lattice.index(np.array([(0.25, 0.05, z) for z in heights]))
         seen.append(blocks.seen[blocks.lattice.keys(at)].tolist())
     assert seen == [[1, 0], [1, 1]]

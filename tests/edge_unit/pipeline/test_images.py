@@ -17,7 +17,7 @@ def test_what_is_expected_and_what_the_filter_leaves() -> None:
     person = placed("person", cylinder_mesh("person", 0.1, 1.0), (-0.5, 0.3, 0.5))
     depth = measured(raycast([*bodies(cell, [0.3]), person], OVERHEAD, CAMERA), CAMERA)
     watched = DepthPipeline(CAMERA, OVERHEAD, cell)
-    before = watched.process(depth, [0.3]).keys
+    before = watched.process(depth, [0.3]).voxels.keys
     expected = picture_raw("expected", depth, watched, [0.3], 0.0)
     known_m = watched.expected_depth([0.3])
     assert (expected == measured(known_m, CAMERA)).all()
@@ -27,7 +27,7 @@ def test_what_is_expected_and_what_the_filter_leaves() -> None:
     assert (left[mask] == depth[mask]).all()
     assert not left[~mask].any()
     # Being looked at changes nothing.
-    assert (watched.process(depth, [0.3]).keys == before).all()
+    assert (watched.process(depth, [0.3]).voxels.keys == before).all()
 
 
 def test_a_raw_picture_comes_back_as_it_was() -> None:

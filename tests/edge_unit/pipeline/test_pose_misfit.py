@@ -84,8 +84,10 @@ def seen_from(X: Transform) -> Misfit:
     cell = small_cell(robot=False)
     eye = camera(424, 240)
     pipeline = DepthPipeline(eye, OVERHEAD, cell)
-    pipeline.process(measured(raycast(bodies(cell, None), OVERHEAD @ X, eye), eye), None)
-    return pipeline.misfit()
+    depth = measured(raycast(bodies(cell, None), OVERHEAD @ X, eye), eye)
+    misfit = pipeline.process(depth, None, with_misfit=True).misfit
+    assert misfit is not None
+    return misfit
 
 
 def test_the_slope_points_to_where_the_camera_is() -> None:

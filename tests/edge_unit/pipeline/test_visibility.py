@@ -6,8 +6,8 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_unit.pipeline import SeenBlocks, Voxels
-from edge_unit.pipeline.visibility import MAX_BLOCKS, Visibility
-from shared.lattice import Lattice
+from edge_unit.pipeline.visibility import Visibility
+from shared.lattice import MAX_BLOCKS, Lattice
 from shared.transforms import apply, inverse, look_at
 from tests.edge_unit.scenes import camera
 
@@ -18,7 +18,7 @@ FAR = np.full(CAMERA.shape, 65535, np.uint16)
 
 
 def look(depth: NDArray[np.uint16], limit: NDArray[np.uint16] = FAR, robot: NDArray[np.uint16] = FAR) -> SeenBlocks:
-    return Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.0).look(depth, limit, robot, 0.9)
+    return Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.9, 0.0).look(depth, limit, robot)
 
 
 def depth_of(blocks: SeenBlocks) -> NDArray[np.float64]:
@@ -78,19 +78,19 @@ def test_nothing_is_seen_through_what_hides_it(image: str) -> None:
 
 
 def test_a_report_is_not_overwritten_by_the_next() -> None:
-    visibility = Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.0)
-    first = visibility.look(FAR, FAR, FAR, 0.9)
+    visibility = Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.9, 0.0)
+    first = visibility.look(FAR, FAR, FAR)
     number = first.seen.sum()
-    visibility.look(np.zeros_like(FAR), FAR, FAR, 0.9)
+    visibility.look(np.zeros_like(FAR), FAR, FAR)
     assert first.seen.sum() == number > 0
 
 
 def test_a_camera_that_moved_looks_elsewhere() -> None:
-    visibility = Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.0)
+    visibility = Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.9, 0.0)
     visibility.place(look_at((0, 0, 1.7), (0, 0, 5.0)))
-    assert not visibility.look(FAR, FAR, FAR, 0.9).seen.any()
+    assert not visibility.look(FAR, FAR, FAR).seen.any()
     visibility.place(ABOVE)
-    assert (visibility.look(FAR, FAR, FAR, 0.9).seen == look(FAR).seen).all()
+    assert (visibility.look(FAR, FAR, FAR).seen == look(FAR).seen).all()
 
 
 def test_packed_bits_start_with_the_first_block_in_the_lowest_bit() -> None:
@@ -116,6 +116,6 @@ def test_a_coarser_block_is_seen_where_all_its_parts_are(shape: tuple[int, int, 
 @pytest.mark.parametrize("size_m", [30.0, 150.0])
 def test_a_large_cell_has_larger_blocks(size_m: float) -> None:
     """150 m in blocks of 5 cm would be 27e9 of them."""
-    visibility = Visibility(CAMERA, ABOVE, np.zeros(3), np.full(3, size_m), 0.05, 0.0)
+    visibility = Visibility(CAMERA, ABOVE, np.zeros(3), np.full(3, size_m), 0.05, 0.9, 0.0)
     assert visibility.lattice.cell_count <= MAX_BLOCKS
     assert visibility.lattice.voxel_size_m * min(visibility.lattice.shape) >= size_m - 1e-6

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from edge_unit.pipeline import Voxels
 from edge_unit.pipeline.edge_halo import EdgeHalo
 from edge_unit.pipeline.expected_depth import RobotLayer
+from edge_unit.pipeline.stage_times import StageRunner
 from edge_unit.pipeline.voxelizer import Voxelizer
 from shared.camera import Intrinsics
 from shared.lattice import Lattice
@@ -25,9 +26,8 @@ def run(voxelizer: Voxelizer, depth: Depth, mask: NDArray[np.bool_]) -> Voxels:
     """Nothing stands before the camera: all that is marked is foreground."""
     intrinsics = camera(depth.shape[1], depth.shape[0])
     room = np.where(mask, np.uint16(65535), np.uint16(0))
-    return voxelizer.keep_dense(
-        voxelizer.count(depth, room, 1, RobotLayer(intrinsics, None, 0.05), EdgeHalo(intrinsics))
-    )
+    nobody = RobotLayer(intrinsics, None, 0.05)
+    return voxelizer.voxels(depth, room, 1, nobody, EdgeHalo(intrinsics), StageRunner())
 
 
 def points_m(intrinsics: Intrinsics, T_world_camera: Transform, depth: Depth) -> NDArray[np.float64]:

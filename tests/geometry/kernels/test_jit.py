@@ -27,9 +27,7 @@ pipeline = DepthPipeline(
     Cell.load("assets/cells/demo/cell.yaml"),
 )
 depth = np.full((240, 424), 700, np.uint16)
-voxels = pipeline.process(depth, np.zeros(6))
-pipeline.seen()
-pipeline.health()
+voxels = pipeline.process(depth, np.zeros(6)).voxels
 print(len(voxels), time.clock_gettime(time.CLOCK_MONOTONIC) - started_s)
 """
 

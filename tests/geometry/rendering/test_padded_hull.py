@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import trimesh
 
 from geometry.kernels import hull as kernels
-from geometry.rendering import hull_around
+from geometry.rendering import hull_around, padded_hull
 from geometry.rendering.padded_hull import DISTANCE_MIN_M
 from shared.cell import Cell
 from shared.errors import InputError
@@ -92,14 +94,68 @@ def test_the_same_mesh_has_its_hull_at_once() -> None:
 def test_samples_cover_a_triangle() -> None:
     vertices = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.07, 0]], np.float32)
     faces = np.array([[0, 1, 2]], np.int32)
-    number = kernels.sample_faces(vertices, faces, 0.003, np.empty((0, 3), np.float32))
+    number = kernels.sample_faces(vertices, faces, 0.003, 0, np.empty((0, 3), np.float32))
     samples = np.empty((number, 3), np.float32)
-    assert kernels.sample_faces(vertices, faces, 0.003, samples) == number
+    assert kernels.sample_faces(vertices, faces, 0.003, 0, samples) == number
     rng = np.random.default_rng(0)
     share = rng.dirichlet((1, 1, 1), 500)
     points = share @ vertices
     nearest = np.linalg.norm(points[:, None] - samples[None], axis=2).min(axis=1)
     assert nearest.max() <= 0.003
+
+
+def test_samples_are_the_same_however_many_are_taken_at_once() -> None:
+    mesh = box_mesh("box", (0.1, 0.02, 0.3))
+    number = kernels.sample_faces(mesh.vertices, mesh.faces, 0.004, 0, np.empty((0, 3), np.float32))
+    every = np.empty((number, 3), np.float32)
+    kernels.sample_faces(mesh.vertices, mesh.faces, 0.004, 0, every)
+    for size in (1, 700, number - 1, number, number + 5):
+        for first in range(0, number, max(size, number // 7)):
+            some = np.full((size, 3), np.nan, np.float32)
+            assert kernels.sample_faces(mesh.vertices, mesh.faces, 0.004, first, some) == number
+            np.testing.assert_array_equal(some[: number - first], every[first : first + size])
+            assert np.isnan(some[number - first :]).all()
+
+
+def test_a_mesh_that_is_sampled_in_parts_is_no_farther(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a grain that lies in several parts each gives a sample; all that there were otherwise are among them."""
+    mesh = cylinder_mesh("cylinder", 0.1, 0.4)
+    grid = np.full(3, -0.2, np.float32), np.array((50, 50, 70)), 0.25 * HULL_M, HULL_M
+    whole_m = padded_hull._distance(mesh, *grid)
+    monkeypatch.setattr(padded_hull, "SAMPLES_AT_ONCE", 1000)
+    parts_m = padded_hull._distance(mesh, *grid)
+    assert (parts_m <= whole_m).all()
+    at_hull = np.abs(whole_m - HULL_M) < 0.25 * HULL_M
+    assert at_hull.any()
+    assert (whole_m - parts_m)[at_hull].max() < 0.01 * HULL_M
+
+
+def slivers(number: int) -> TriangleMesh:
+    """A cylinder of 1.2 m, as CAD has it: two long triangles for each of many sides."""
+    turn = np.linspace(0.0, 2.0 * np.pi, number, endpoint=False)
+    ring = 0.3 * np.stack((np.cos(turn), np.sin(turn)), axis=1)
+    vertices = np.vstack([np.column_stack((ring, np.full(number, z))) for z in (0.0, 1.2)]).astype(np.float32)
+    this = np.arange(number)
+    following = (this + 1) % number
+    faces = np.vstack(
+        (
+            np.column_stack((this, following, this + number)),
+            np.column_stack((following, following + number, this + number)),
+        )
+    )
+    return TriangleMesh("slivers", vertices, faces.astype(np.int32), closed=False)
+
+
+def test_a_large_mesh_takes_little_memory() -> None:
+    mesh = slivers(60)
+    number = kernels.sample_faces(mesh.vertices, mesh.faces, 0.1 * HULL_M, 0, np.empty((0, 3), np.float32))
+    assert number > 3 * padded_hull.SAMPLES_AT_ONCE
+    tracemalloc.start()
+    try:
+        padded_hull._make_hull(mesh, HULL_M)
+        assert tracemalloc.get_traced_memory()[1] < 150e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_distances_are_those_of_the_nearest_sample() -> None:

@@ -75,13 +75,14 @@ def corpus(unit: FakeUnit) -> list[bytes]:
 
 def known_of(desk: Desk, unit: FakeUnit) -> tuple[Any, ...]:
     """All that the master knows of one unit, but for how old it is."""
-    state = desk.app.state.master
+    state = desk.app.services.master
     slot = next(slot for slot in state.registry if slot.id == unit.initialized.id)
     keys, _ = state.map.voxels()
+    reported, session = state.map.keys_of(slot.id).tolist(), slot.session
     return (
-        slot.id, slot.ip, slot.serial, slot.session, slot.sequence, slot.keys.tolist(), slot.T_world_camera,
-        slot.pose_version, slot.versions, slot.health, list(slot.commands), state.coverage.has(slot.id),
-        state.coverage.seen_by([slot.id]).tobytes(), set(slot.keys.tolist()) <= set(keys.tolist()),
+        slot.id, slot.ip, slot.serial, session.number, session.sequence, reported, slot.T_world_camera,
+        slot.pose_version, session.versions, session.health, list(slot.commands), state.coverage.has(slot.id),
+        state.coverage.seen_by([slot.id]).tobytes(), set(reported) <= set(keys.tolist()),
     )  # fmt: skip
 
 

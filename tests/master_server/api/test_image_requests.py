@@ -62,7 +62,7 @@ async def test_a_picture_that_does_not_come_is_not_waited_for(desk: Desk, monkey
     response = await desk.call("GET", "/units/1/images/depth")
     assert response.status_code == 504
     assert response.json()["detail"] == "unit 1: its picture did not come within 0.05 s, see GET /units"
-    assert not desk.app.state.pictures._awaited
+    assert not desk.app.services.pictures._awaited
 
 
 async def test_why_there_is_no_picture_is_told(desk: Desk) -> None:

@@ -83,7 +83,7 @@ def desk(tmp_path: Path) -> Desk:
 @pytest.fixture
 async def fresh_desk(desk: Desk) -> AsyncIterator[Desk]:
     yield desk
-    await desk.app.state.recorder.stop()
+    await desk.app.services.recorder.stop()
 
 
 @pytest.mark.parametrize(("method", "path", "operation", "kind", "value"), EXAMPLES)
@@ -158,7 +158,7 @@ async def test_the_pages_ask_for_nothing_beyond_the_master(page: str, fresh_desk
 
 async def test_the_document_follows_the_cell(fresh_desk: Desk) -> None:
     moved = [[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, 0.2], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-    name = next(one["name"] for one in fresh_desk.app.state.master.published.document["objects"])
+    name = next(one["name"] for one in fresh_desk.app.services.master.published.document["objects"])
     await fresh_desk.call("PUT", f"/cell/objects/{name}/pose", json={"T_world_object": moved})
     told = (await fresh_desk.call("GET", "/openapi.json", None)).json()
     example = bodies(told["paths"]["/cell"]["put"])[0][1]

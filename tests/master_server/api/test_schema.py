@@ -141,7 +141,7 @@ def test_answers_are_as_described(
     try:
         ask()
     finally:
-        loop.run_until_complete(desk.app.state.recorder.stop())
+        loop.run_until_complete(desk.app.services.recorder.stop())
 
 
 def example_of(label: str) -> Any:

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from master_server.core.coverage import MAX_BLOCKS, Coverage, blocks_of
-from shared.cell import Cell
+from master_server.core.coverage import Coverage
 from shared.errors import WireError
 from shared.lattice import Lattice
 from shared.messages import SeenReport, matrix_of
@@ -87,12 +86,3 @@ def test_other_blocks_are_refused(size_m: float) -> None:
     with pytest.raises(WireError, match="block_size_m"):
         coverage.report(1, report(noise(1), size_m))
     assert not coverage.has(1)
-
-
-def test_a_hall_has_larger_blocks() -> None:
-    hall = Cell("hall", np.zeros(3), np.array([100.0, 100.0, 10.0]))
-    blocks = blocks_of(hall, 0.05)
-    assert blocks.cell_count <= MAX_BLOCKS < 8 * blocks.cell_count
-    assert blocks.voxel_size_m == 0.05 * 2**5
-    small = Cell("small", np.zeros(3), np.ones(3))
-    assert blocks_of(small, 0.1) == small.lattice(0.1)

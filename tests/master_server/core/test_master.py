@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from shared.messages import (
     Outcome,
     PoseOrigin,
     Progress,
+    UnitRow,
     Versions,
 )
 from shared.settings import Settings
@@ -282,6 +284,8 @@ def cause(one: Master, unit: FakeUnit, now_ns: int = NOW_NS) -> tuple[str, dict[
     row = next(row for row in one.units(now_ns) if row.id == unit.initialized.id)
     assert row.cause is not None
     assert row.cause.sentence == row.reason
+    # As the window is told.
+    assert UnitRow.model_validate(row.model_dump(), strict=True) == row
     return row.cause.code, row.cause.numbers
 
 
@@ -315,9 +319,10 @@ def test_a_state_has_a_code_and_numbers(changes: dict[str, Any], code: str, numb
     assert found == code
     assert told.items() >= numbers.items()
     (row,) = one.unit_states(NOW_NS)
-    assert row["cause"].code == code
+    assert row.cause is not None
+    assert row.cause.code == code
     causes = {each.code: each.numbers for each in one.view(NOW_NS).causes}
-    assert (code in causes) == (row["state"] != "live")
+    assert (code in causes) == (row.state != "live")
     assert causes.get(code, {"unit": 1})["unit"] == 1
 
 
@@ -530,7 +535,7 @@ def test_settings_that_are_refused_change_nothing(monkeypatch: pytest.MonkeyPatc
     def refuse(*_: Any) -> Lattice:
         raise InputError("no such blocks")
 
-    monkeypatch.setattr("master_server.core.master.blocks_of", refuse)
+    monkeypatch.setattr(Cell, "blocks", refuse)
     with pytest.raises(InputError):
         one.change_settings({"voxel_size_m": 0.04, "seen_block_size_m": 0.05})
     assert (one.settings, one.versions, one.lattice, one.coverage.blocks) == before
@@ -585,6 +590,40 @@ def test_commands_are_repeated_until_they_are_done() -> None:
     assert unit.update(NOW_NS, done=(Ended.of(command.id, Outcome("failed", "too late")),)).commands == ()
     (row,) = one.units(NOW_NS)
     assert row.last_command == CommandRow(id=command.id, verb="learn_background", outcome="done", code="done")
+
+
+def test_who_asks_changes_and_logs_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    one = master()
+    unit = live(one, 1, 5)
+    command = one.ask(unit.initialized.id, "calibrate", NOW_NS)
+    slot = one.registry.get(unit.initialized.id)
+    one.tick(NOW_NS)
+    before = (one.map.revision, slot.told_state, slot.commands, slot.last_command, one.coverage.has(slot.id))
+    caplog.clear()
+    for now_ns, expected in ((NOW_NS, {5: 1}), (NOW_NS + 3600 * S, {}), (NOW_NS, {5: 1})):
+        view = one.view(now_ns)
+        assert dict(zip(view.keys.tolist(), view.witnesses.tolist(), strict=True)) == expected
+        assert (view.complete, view.units_live, sorted(view.reports)) == (
+            bool(expected),
+            len(expected),
+            [1][: len(expected)],
+        )
+        assert one.seen_by(now_ns).any() == bool(expected)
+        (row,), (told,) = one.units(now_ns), one.unit_states(now_ns)
+        assert row.state == told.state == ("live" if expected else "stale")
+        assert row.voxels == told.voxels == 1
+        assert row.last_command is not None
+        assert (row.last_command.outcome is None) == bool(expected)
+        one.next_change_ns(now_ns)
+        one.robot_answer(None, now_ns)
+    assert before == (one.map.revision, slot.told_state, (command,), slot.last_command, one.coverage.has(slot.id))
+    assert before[2] == (command,)
+    assert not caplog.records
+    one.tick(NOW_NS + 3600 * S)
+    assert slot.told_state == "stale"
+    assert slot.commands == ()
+    assert {record.levelname for record in caplog.records} == {"WARNING", "INFO"}
 
 
 def test_commands_are_bounded() -> None:

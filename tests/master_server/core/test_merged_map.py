@@ -21,8 +21,8 @@ def keys(*values: int) -> NDArray[np.uint32]:
     return np.array(sorted(values), dtype=np.uint32)
 
 
-def content(merged: MergedMap) -> dict[int, int]:
-    found, witnesses = merged.voxels()
+def content(merged: MergedMap, *unit_ids: int) -> dict[int, int]:
+    found, witnesses = merged.voxels(unit_ids or None)
     assert (np.diff(found.astype(np.int64)) > 0).all()
     return dict(zip(found.tolist(), witnesses.tolist(), strict=True))
 
@@ -72,6 +72,18 @@ def test_who_reports_what_is_known() -> None:
     assert {unit_id: found.tolist() for unit_id, found in before.items()} == {1: [1, 2], 2: [2]}
     merged.withdraw(2)
     assert {unit_id: found.tolist() for unit_id, found in merged.reports().items()} == {1: [7]}
+
+
+def test_the_union_of_some_leaves_the_others_out() -> None:
+    merged = MergedMap(LATTICE)
+    merged.replace(1, keys(1, 2))
+    merged.replace(2, keys(2, 3))
+    for _ in range(2):
+        assert content(merged, 2) == {2: 1, 3: 1}
+        assert content(merged) == {1: 1, 2: 2, 3: 1}
+    assert content(merged, 7) == {}
+    assert merged.keys_of(7).size == 0
+    assert {unit_id: found.tolist() for unit_id, found in merged.reports((2, 7)).items()} == {2: [2, 3], 7: []}
 
 
 def test_an_empty_map_has_no_voxels() -> None:
@@ -136,6 +148,12 @@ class MergeMachine(RuleBasedStateMachine):
     def withdraw(self, unit: int) -> None:
         self.map.withdraw(unit)
         self.revision += self.twin.pop(unit, None) is not None
+
+    @rule(units=st.sets(UNITS))
+    def ask_of_some(self, units: set[int]) -> None:
+        keys, witnesses = self.map.voxels(sorted(units))
+        counts = Counter(key for unit in units for key in self.twin.get(unit, ()))
+        assert dict(zip(keys.tolist(), witnesses.tolist(), strict=True)) == counts
 
     @invariant()
     def says_what_the_sets_say(self) -> None:

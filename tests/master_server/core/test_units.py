@@ -101,7 +101,7 @@ class RegistryMachine(RuleBasedStateMachine):
     def update(self, data: st.DataObject) -> None:
         ip = data.draw(st.sampled_from(sorted(self.twin)))
         slot = self.registry.own(self.twin[ip].id, ip)
-        slot.arrived_at_ns = self.twin[ip].updated_at_ns = self.now_ns
+        slot.session.arrived_at_ns = self.twin[ip].updated_at_ns = self.now_ns
 
     @precondition(lambda self: self.twin)
     @rule(data=st.data())

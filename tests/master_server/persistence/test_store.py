@@ -239,9 +239,7 @@ def test_a_store_of_a_newer_master_is_refused(path: Path) -> None:
     newer.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 1}")
     newer.close()
     content = path.read_bytes()
-    with pytest.raises(
-        ConfigError, match=f"version {SCHEMA_VERSION}, got version {SCHEMA_VERSION + 1}.*newer.*put back"
-    ):
+    with pytest.raises(ConfigError, match=f"got version {SCHEMA_VERSION + 1}.*newer.*put back"):
         Store.open(path)
     assert path.read_bytes() == content
 

@@ -61,7 +61,7 @@ async def serving(access: Access | None = None, **options: Any) -> AsyncIterator
         server = uvicorn.Server(config)
         task = asyncio.ensure_future(server.serve([listener]))
         try:
-            yield Place(one, app.state.stream, listener.getsockname()[1], app)
+            yield Place(one, app.services.stream, listener.getsockname()[1], app)
         finally:
             server.should_exit = True
             await task

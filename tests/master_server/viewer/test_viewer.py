@@ -3,8 +3,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import inspect
 import json
 import re
+import socket
+import threading
 from collections.abc import AsyncIterator
 from http.cookies import Morsel, SimpleCookie
 from types import SimpleNamespace
@@ -14,12 +18,26 @@ import httpx
 import msgpack
 import numpy as np
 import pytest
+import viser
 
 from master_server.api.history import SAMPLES_MAX, History, Sample
 from master_server.app import add_viewer, make_app
 from master_server.core import Master
 from master_server.security import Access, Role
-from master_server.viewer.panel import contact_sheet, lattice_of, legend_html, status_html, table_html
+from master_server.viewer.channel import LENGTH, Asker, pack, receive
+from master_server.viewer.messages import (
+    ApiAnswer,
+    ApiRequest,
+    BeginAnswer,
+    BeginRequest,
+    Look,
+    LookRequest,
+    ReadyAnswer,
+    ReadyRequest,
+    RefusedAnswer,
+    ViewerMessage,
+)
+from master_server.viewer.panel import contact_sheet, legend_html, status_html, table_html
 from master_server.viewer.proxy import LOGIN_PAGE, Gate, is_passed, link_path
 from master_server.viewer.scene import (
     SHARED_COLOUR,
@@ -32,11 +50,12 @@ from master_server.viewer.scene import (
     view_edges,
 )
 from master_server.viewer.sessions import LINK_S, LINKS_MAX, SESSION_S, Sessions, Viewer
-from master_server.viewer.snapshot import Wanted, look
+from master_server.viewer.snapshot import look
 from master_server.viewer.window import voxels_of
 from shared.camera import Intrinsics
-from shared.errors import Refusal
+from shared.errors import Refusal, WireError
 from shared.lattice import Lattice
+from shared.messages import CommandRow, Health, Progress, UnitRow
 from tests.master_server.fakes import START_NS, S, joined, master, sees_all
 
 UNIT, OPERATOR = b"u" * 32, b"o" * 32
@@ -185,22 +204,32 @@ def test_a_look_tells_what_is_drawn() -> None:
     history = History(watched)
     history.take(START_NS - S)
     history.take(START_NS)
-    told = told_of(watched, history, Wanted(units=True, unseen=True, since_ns=START_NS - S))
-    assert [Sample(*values) for values in told["history"]] == [Sample(START_NS, None, 0, 0, False)]
-    assert lattice_of(told["lattice"]) == watched.lattice
-    blocks = lattice_of(told["blocks"])
-    assert len(told["seen"]) == -(-blocks.cell_count // 8)
-    assert told["reasons"] == ["there is no unit"]
-    assert told["robot"]["state"] == "none"
+    told = told_of(watched, history, LookRequest(units=True, unseen=True, since_ns=START_NS - S))
+    assert told.history == (Sample(START_NS, None, 0, 0, False),)
+    assert told.map.lattice.lattice() == watched.lattice
+    assert told.seen is not None
+    assert told.seen.blocks.lattice() == watched.coverage.blocks
+    assert len(told.seen.bits) == -(-watched.coverage.blocks.cell_count // 8)
+    assert told.reasons == ("there is no unit",)
+    assert told.robot.state == "none"
     assert "The map is not complete" in status_html(told)
-    assert "No unit has registered yet" in table_html(told["units"])
-    assert not {"units", "history", "reports", "seen"} & told_of(watched, history, Wanted()).keys()
+    assert told.units == ()
+    assert "No unit has registered yet" in table_html(told.units)
+    least = told_of(watched, history, LookRequest())
+    assert (least.units, least.history, least.map.reports, least.seen) == (None, (), None, None)
 
 
-def told_of(watched: Master, history: History, wanted: Wanted, now_ns: int = START_NS) -> dict[str, Any]:
+def told_of(watched: Master, history: History, wanted: LookRequest, now_ns: int = START_NS) -> Look:
     """A look as it comes out of the channel."""
-    told: dict[str, Any] = msgpack.unpackb(msgpack.packb(look(watched, history, wanted, now_ns)), strict_map_key=False)
-    return told
+    packed = pack(1, look(watched, history, wanted, now_ns))
+    _, fields = msgpack.unpackb(packed[LENGTH.size :], strict_map_key=False)
+    return Look.model_validate(fields)
+
+
+def row(watched: Master, **changes: Any) -> UnitRow:
+    """The row of the one unit of a master, changed."""
+    (found,) = watched.units(START_NS)
+    return found.model_copy(update=changes)
 
 
 def test_colours_tell_how_many_or_who() -> None:
@@ -208,13 +237,13 @@ def test_colours_tell_how_many_or_who() -> None:
     for number, keys in ((1, [3, 4]), (2, [4, 5])):
         joined(watched, number).update(START_NS, keys, seen=sees_all(watched))
     history = History(watched)
-    voxels = voxels_of(told_of(watched, history, Wanted(reports=True)))
+    voxels = voxels_of(told_of(watched, history, LookRequest(reports=True)).map)
     assert voxels.owners.tolist() == [1, 0, 2]
     assert voxels.colours(by_unit=False).tolist() == linear([WITNESS_COLOURS[i] for i in (0, 1, 0)]).tolist()
     expected = linear([unit_colour(1), SHARED_COLOUR, unit_colour(2)])
     assert voxels.colours(by_unit=True).tolist() == expected.tolist()
     # Nobody asked who reports them.
-    assert voxels_of(told_of(watched, history, Wanted())).owners.tolist() == [0, 0, 0]
+    assert voxels_of(told_of(watched, history, LookRequest()).map).owners.tolist() == [0, 0, 0]
 
 
 def test_what_is_linear_is_shown_as_meant() -> None:
@@ -229,12 +258,12 @@ def test_every_colour_of_a_unit_is_another() -> None:
 
 
 def test_a_legend_names_what_is_drawn() -> None:
-    rows = [{"id": 1}, {"id": 4}]
+    rows = (1, 4)
     assert [text in legend_html(False, rows, True) for text in ("1 unit<", "2 units<", "3 or more<", "unit 4")] == [
         True, True, True, False,
     ]  # fmt: skip
     by_unit = legend_html(True, rows, True)
-    assert all(f"rgb{unit_colour(row['id'])}" in by_unit and f"unit {row['id']}<" in by_unit for row in rows)
+    assert all(f"rgb{unit_colour(unit_id)}" in by_unit and f"unit {unit_id}<" in by_unit for unit_id in rows)
     assert "several units" in by_unit
     assert "not recorded" in legend_html(True, rows, False)
 
@@ -252,15 +281,12 @@ def test_a_view_is_that_of_its_own_camera() -> None:
 
 
 def test_who_learns_shows_how_far_it_is() -> None:
-    row = {
-        "id": 1, "ip": "10.0.0.1", "state": "blind", "reason": "frame 12 of 60", "age_s": 0.1,
-        "fps": 15.0, "process_ms": 5.0, "voxels": 0, "last_command": None,
-        "health": {"valid_share": 0.9, "agreeing_share": 0.0, "static_share": 0.0},
-    }  # fmt: skip
-    health = row["health"] | {"progress": {"task": "background", "done": 12, "total": 60}}
-    assert '<progress value="12" max="60"></progress>' in table_html([row | {"health": health}])
+    watched = master()
+    joined(watched)
+    health = Health(progress=Progress(task="background", done=12, total=60))
+    assert '<progress value="12" max="60"></progress>' in table_html([row(watched, reason="learns", health=health)])
     # A unit of contract 5.0, or a recording of one, tells it to people only.
-    assert "<progress" not in table_html([row | {"reason": "learning the background: frame 12 of 60"}])
+    assert "<progress" not in table_html([row(watched, reason="learning the background: frame 12 of 60")])
 
 
 async def test_the_last_minutes_are_there_for_who_asks() -> None:
@@ -268,7 +294,7 @@ async def test_the_last_minutes_are_there_for_who_asks() -> None:
     app = make_app(watched, Access(UNIT, OPERATOR))
     joined(watched, 1).update(START_NS, [3], seen=sees_all(watched))
     for number in range(SAMPLES_MAX + 5):
-        app.state.history.take(START_NS + number * S // 1000)
+        app.services.history.take(START_NS + number * S // 1000)
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://master:8420") as client:
         assert (await client.get("/history")).status_code == 401
         answer = await client.get("/history", headers={"Authorization": f"Bearer {UNIT.decode()}"})
@@ -280,19 +306,11 @@ async def test_the_last_minutes_are_there_for_who_asks() -> None:
 
 
 def test_what_a_unit_says_of_itself_is_no_markup() -> None:
-    row = {
-        "id": 1,
-        "ip": "<b>",
-        "state": "stale",
-        "reason": "<script>alert(1)</script>",
-        "age_s": None,
-        "fps": 0.0,
-        "process_ms": 0.0,
-        "voxels": 0,
-        "health": {"valid_share": 0.0, "agreeing_share": 0.0, "static_share": 0.0},
-        "last_command": {"verb": "refine", "outcome": "<i>", "code": "failed", "detail": "<i>"},
-    }
-    shown = table_html([row])
+    watched = master()
+    joined(watched)
+    command = CommandRow(id=1, verb="refine", outcome="<i>")
+    shown = table_html([row(watched, ip="<b>", reason="<script>alert(1)</script>", last_command=command)])
+    assert "refine: &lt;i&gt;" in shown
     assert 'data-unit="1" data-state="stale"' in shown
     assert "&lt;script&gt;" in shown
     assert not re.search("<(?:script|i)>", shown)
@@ -325,3 +343,75 @@ def test_three_pictures_are_one() -> None:
     sheet = contact_sheet([first, second, third])
     assert sheet.shape == (4, 6, 3)
     assert (sheet[0, 0, 0], sheet[0, 5, 0], sheet[3, 0, 0], sheet[3, 5, 0]) == (1, 2, 3, 0)
+
+
+REQUESTS: tuple[ViewerMessage, ...] = (
+    BeginRequest(),
+    ReadyRequest(port=8421),
+    LookRequest(units=True, since_ns=START_NS),
+    ApiRequest(method="PUT", path="/settings", body={"voxel_size_m": 0.1}, viewer=Viewer.OPERATOR),
+)
+
+
+async def test_each_request_arrives_as_it_was_asked() -> None:
+    reader = asyncio.StreamReader()
+    for number, request in enumerate(REQUESTS):
+        reader.feed_data(pack(number, request))
+    reader.feed_eof()
+    assert [await receive(reader) for _ in REQUESTS] == list(enumerate(REQUESTS))
+    assert await receive(reader) is None
+
+
+@pytest.mark.parametrize("fields", [{"verb": "begin", "more": 1}, {"verb": "stop"}, {}, None, {"verb": "ready"}])
+async def test_what_no_window_asks_is_refused(fields: object) -> None:
+    reader = asyncio.StreamReader()
+    data = msgpack.packb((1, fields))
+    reader.feed_data(LENGTH.pack(len(data)) + data)
+    with pytest.raises(WireError, match="viewer: "):
+        await receive(reader)
+
+
+@pytest.mark.parametrize(
+    ("answer", "expected"),
+    [
+        (BeginAnswer(key="k", actions={"Blink": "http://10.0.0.9/"}, is_replay=False), None),
+        (RefusedAnswer(refused="recording: damaged at 3 s"), "recording: damaged at 3 s"),
+        (ReadyAnswer(), "no BeginAnswer"),
+        (ApiAnswer(status=200, body=b"1"), "no BeginAnswer"),
+    ],
+)
+def test_an_answer_is_of_the_kind_that_was_asked_for(answer: ViewerMessage, expected: str | None) -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        asker = Asker(theirs)
+        listening = threading.Thread(target=asker.listen)
+        listening.start()
+
+        def answer_it() -> None:
+            # The first question of an asker is number 0.
+            ours.recv(LENGTH.size)
+            ours.sendall(pack(0, answer))
+
+        waiting = threading.Thread(target=answer_it)
+        waiting.start()
+        if expected is None:
+            assert asker.ask(BeginRequest(), BeginAnswer) == answer
+        else:
+            with pytest.raises(Refusal, match=expected):
+                asker.ask(BeginRequest(), BeginAnswer)
+        waiting.join()
+        ours.shutdown(socket.SHUT_RDWR)
+        listening.join()
+
+
+def test_the_private_parts_of_viser_that_the_window_takes_are_there() -> None:
+    """A contract: `window` asks who comes by these, for viser itself asks nobody; another version may lack them."""
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        callbacks = server._websock_server._client_connect_cb
+        assert isinstance(callbacks, list)
+        assert len(inspect.signature(callbacks[0]).parameters) == 1
+        assert server._websock_server._live_connections == {}
+        assert callable(server.request_share_url)
+    finally:
+        server.stop()

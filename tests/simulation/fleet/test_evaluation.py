@@ -51,7 +51,7 @@ class Recorded:
         lattice, records = pipeline.lattice, []
         async for frame in source.frames():
             joints = world.joints_at((frame.captured_at_ns - self.epoch_ns) / NS_PER_S)
-            keys = pipeline.process(frame.depth, joints).keys.astype("<u4").tobytes()
+            keys = pipeline.process(frame.depth, joints).voxels.keys.astype("<u4").tobytes()
             merged_at_ns = frame.captured_at_ns + LATE_MS * NS_PER_MS
             records.append(
                 TraceRecord(

@@ -298,4 +298,4 @@ async def test_the_demo_cell_as_its_folder_lies_there(desk: Desk) -> None:
     response: httpx.Response = await desk.call("PUT", "/cell", content=content, headers=ZIP)
     assert response.status_code == 200, response.text
     assert response.json()["cell"] == expected.reference.model_dump()
-    assert desk.app.state.master.published.meshes == expected.meshes
+    assert desk.app.services.master.published.meshes == expected.meshes

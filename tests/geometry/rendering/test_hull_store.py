@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hulls on disk: the same as made anew, whole or not there, bounded, and never what a unit fails of."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+from pathlib import Path
+
+import pytest
+
+from geometry.compilation.cache import folder_beside
+from geometry.rendering import hull_around, hull_store, padded_hull
+from geometry.rendering.hull_store import HullStore, state_of_code
+from shared.meshes import TriangleMesh, box_mesh, sphere_mesh
+
+HULL_M = 0.05
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "hulls"
+
+
+@pytest.fixture
+def made(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The names of the meshes of which hulls were made, into `folder`; each `start` is one of a unit."""
+    names: list[str] = []
+    make = padded_hull._make_hull
+
+    def spy(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
+        names.append(mesh.name)
+        return make(mesh, distance_m)
+
+    monkeypatch.setattr(padded_hull, "_make_hull", spy)
+    start(monkeypatch, folder)
+    return names
+
+
+def start(monkeypatch: pytest.MonkeyPatch, folder: Path, code_state: str = "1") -> None:
+    store = HullStore(folder, code_state)
+    monkeypatch.setattr(padded_hull, "_hulls", {})
+    monkeypatch.setattr(padded_hull, "_store", lambda: store)
+
+
+def same(one: TriangleMesh, other: TriangleMesh) -> bool:
+    return one.to_bytes() == other.to_bytes()
+
+
+def test_the_second_start_finds_what_the_first_made(
+    folder: Path, made: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = hull_around(sphere_mesh("ball", 0.2), HULL_M)
+    assert made == ["ball"]
+    start(monkeypatch, folder)
+    second = hull_around(sphere_mesh("the same ball", 0.2), HULL_M)
+    assert made == ["ball"]
+    assert same(second, first)
+    assert second.name == "the same ball"
+    assert second.closed
+
+
+def test_another_mesh_distance_or_code_has_another_hull(
+    folder: Path, made: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh = box_mesh("box", (0.1, 0.1, 0.1))
+    hull_around(mesh, HULL_M)
+    hull_around(mesh, 0.04)
+    hull_around(box_mesh("other", (0.1, 0.1, 0.2)), HULL_M)
+    assert made == ["box", "box", "other"]
+    start(monkeypatch, folder, "2")
+    hull_around(mesh, HULL_M)
+    assert made == ["box", "box", "other", "box"]
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "bit", "other's", "no mesh"])
+def test_a_damaged_file_is_taken_out_and_made_anew(
+    folder: Path, made: list[str], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, damage: str
+) -> None:
+    mesh = box_mesh("box", (0.1, 0.1, 0.1))
+    first = hull_around(mesh, HULL_M)
+    (file,) = folder.iterdir()
+    content = file.read_bytes()
+    if damage == "other's":
+        hull_around(box_mesh("other", (0.2, 0.1, 0.1)), HULL_M)
+        (other,) = set(folder.iterdir()) - {file}
+        file.write_bytes(other.read_bytes())
+    elif damage == "no mesh":
+        file.write_bytes(hull_store._digest(file, b"text") + b"text")
+    else:
+        flipped = content[:-9] + bytes([content[-9] ^ 1]) + content[-8:]
+        file.write_bytes({"empty": b"", "cut": content[:-5], "bit": flipped}[damage])
+    made.clear()
+    start(monkeypatch, folder)
+    assert same(hull_around(mesh, HULL_M), first)
+    assert made == ["box"]
+    assert f"{file}: damaged, the hull of box is made anew" in caplog.text
+    assert file.read_bytes() == content
+
+
+def test_those_not_used_for_longest_go_first(folder: Path, made: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    meshes = [box_mesh(f"box {number}", (0.1, 0.1, 0.1 + 0.1 * number)) for number in range(4)]
+    monkeypatch.setattr(hull_store, "FILES_MAX", 3)
+    for number, mesh in enumerate(meshes[:3]):
+        known = set(folder.iterdir()) if folder.exists() else set()
+        hull_around(mesh, HULL_M)
+        (file,) = set(folder.iterdir()) - known
+        os.utime(file, (number, number))
+    start(monkeypatch, folder)
+    hull_around(meshes[0], HULL_M)
+    hull_around(meshes[3], HULL_M)
+    assert len(list(folder.iterdir())) == 3
+    made.clear()
+    start(monkeypatch, folder)
+    for mesh in (meshes[0], meshes[2], meshes[3]):
+        hull_around(mesh, HULL_M)
+    assert made == []
+    hull_around(meshes[1], HULL_M)
+    assert made == ["box 1"]
+
+
+def test_their_bytes_are_bounded_too(folder: Path, made: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    hull_around(box_mesh("box", (0.1, 0.1, 0.1)), HULL_M)
+    size = sum(file.stat().st_size for file in folder.iterdir())
+    monkeypatch.setattr(hull_store, "BYTES_MAX", 3 * size)
+    (folder / "left behind.partial").write_bytes(bytes(size))
+    for number in range(1, 6):
+        hull_around(box_mesh("box", (0.1, 0.1, 0.1 + 0.01 * number)), HULL_M)
+        assert sum(file.stat().st_size for file in folder.iterdir()) <= 3 * size
+    monkeypatch.setattr(hull_store, "BYTES_MAX", size // 2)
+    files = set(folder.iterdir())
+    hull_around(box_mesh("box", (0.3, 0.1, 0.1)), HULL_M)
+    assert set(folder.iterdir()) == files
+
+
+def test_a_full_disk_is_a_warning_once(
+    folder: Path, made: list[str], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(path: Path, content: bytes, *, synced: bool) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(hull_store, "write_whole", full)
+    for size_m in (0.1, 0.2):
+        assert hull_around(box_mesh("box", (0.1, 0.1, size_m)), HULL_M).closed
+    assert made == ["box", "box"]
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert str(folder) in record.getMessage()
+    assert "No space left on device" in record.getMessage()
+
+
+def test_a_folder_that_cannot_be_made_is_a_warning_once(
+    folder: Path, made: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    folder.write_text("a file is in the way")
+    for size_m in (0.1, 0.2):
+        assert hull_around(box_mesh("box", (0.1, 0.1, size_m)), HULL_M).closed
+    assert made == ["box", "box"]
+    assert len(caplog.records) == 1
+
+
+def test_the_state_of_the_code_tells_sources_and_libraries_apart(tmp_path: Path) -> None:
+    one, other = tmp_path / "one.py", tmp_path / "other.py"
+    one.write_text("a = 1")
+    other.write_text("b = 1")
+    states = {
+        state_of_code((one,), ("library 1",)),
+        state_of_code((one,), ("library 2",)),
+        state_of_code((other,), ("library 1",)),
+        state_of_code((one, other), ("library 1",)),
+        state_of_code((one, other), ()),
+    }
+    assert len(states) == 5
+    assert state_of_code((one,), ("library 1",)) in states
+
+
+def test_they_lie_beside_the_kernels(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels-0123456789ab"))
+    assert folder_beside("hulls") == tmp_path / "hulls"

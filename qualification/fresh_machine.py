@@ -24,7 +24,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from benchmarks.reporting.report import Mark, Result, line, write
-from qualification.machines.containers import confine, container_trouble
+from qualification.machines.containers import confine, container_trouble, missing_packages
 from qualification.machines.fresh_debian import (
     NAMESPACES,
     REPORTS,
@@ -35,7 +35,6 @@ from qualification.machines.fresh_debian import (
     Unreachable,
     is_unreachable,
     lend,
-    missing_packages,
     settle_in,
 )
 from qualification.networks import allowed
@@ -239,8 +238,8 @@ def why_not() -> str | None:
     """Why it cannot be run here, in one sentence; None where it can."""
     if os.geteuid() != 0:
         return "only root may make root file systems"
-    if packages := missing_packages(TOOLS):
-        return f"missing: apt-get install {' '.join(packages)}"
+    if (missing := missing_packages(TOOLS)) is not None:
+        return missing
     if not allowed(NAMESPACES):
         return "the kernel does not allow mount and process namespaces"
     if (trouble := container_trouble()) is not None:

@@ -23,7 +23,7 @@ import httpx
 
 from benchmarks.reporting.report import Mark, Result, line, write
 from qualification.machines.arm64_boards import EMULATOR_TOOLS, Board
-from qualification.machines.containers import BRIDGE, NAMESPACES, MachineError, confine, until
+from qualification.machines.containers import BRIDGE, NAMESPACES, MachineError, confine, missing_packages, until
 from qualification.machines.image_parts import BUILD_TOOLS, CACHE, CELL, build
 from qualification.networks import allowed, run
 from shared.clock import NS_PER_S, monotonic_ns
@@ -167,9 +167,7 @@ def why_not(building: bool = False) -> str | None:
         return "only root may make networks and images"
     if not allowed(NAMESPACES):
         return "the kernel does not allow network, mount and process namespaces"
-    tools = EMULATOR_TOOLS | (BUILD_TOOLS if building else {})
-    packages = sorted({package for command, package in tools.items() if shutil.which(command) is None})
-    return f"missing: apt-get install {' '.join(packages)}" if packages else None
+    return missing_packages(EMULATOR_TOOLS | (BUILD_TOOLS if building else {}))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

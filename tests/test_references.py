@@ -34,6 +34,7 @@ WRITTEN_ELSEWHERE = (
     "deploy/image/locks/",
     "tests/test_layout.py",
     "tests/test_references.py",
+    "tests/test_shape.py",
     "LICENSE",
 )
 """Made by a program, or about names that are wrong on purpose."""

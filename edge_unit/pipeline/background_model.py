@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.kernels import reference as kernels
+from geometry.kernels.bundles import plain
 from shared.camera import Intrinsics
 from shared.errors import InputError
 from shared.files import write_whole
@@ -135,11 +136,17 @@ class ReferenceLearner:
         shape = (*intrinsics.shape, kernels.MODES)
         self._intrinsics = intrinsics
         self._noise_per_m = noise_per_m
-        self._range_max_m = range_max_m
-        self._looks = np.zeros(intrinsics.shape, np.uint16)
-        self._numbers = np.zeros(shape, np.uint16)
-        self._means_m = np.zeros(shape, np.float32)
-        self._squares_m2 = np.zeros(shape, np.float32)
+        self._matching = plain(
+            kernels.Matching(intrinsics.depth_scale_m, range_max_m, MATCH_BASE_M, MATCH_SIGMAS * noise_per_m)
+        )
+        self._modes = plain(
+            kernels.Modes(
+                looks=np.zeros(intrinsics.shape, np.uint16),
+                numbers=np.zeros(shape, np.uint16),
+                means_m=np.zeros(shape, np.float32),
+                squares_m2=np.zeros(shape, np.float32),
+            )
+        )
         self.frames = 0
 
     def add(
@@ -155,19 +162,7 @@ class ReferenceLearner:
         """
         if self.frames >= MAX_FRAMES:
             raise InputError(f"reference: expected at most {MAX_FRAMES} frames")
-        kernels.observe(
-            depth_raw,
-            robot_near_raw,
-            robot_span_raw,
-            self._intrinsics.depth_scale_m,
-            self._range_max_m,
-            MATCH_BASE_M,
-            MATCH_SIGMAS * self._noise_per_m,
-            self._looks,
-            self._numbers,
-            self._means_m,
-            self._squares_m2,
-        )
+        kernels.observe(depth_raw, robot_near_raw, robot_span_raw, self._matching, self._modes)
         self.frames += 1
 
     def reference(self) -> Reference:
@@ -180,15 +175,6 @@ class ReferenceLearner:
             raise InputError("reference: expected at least one frame of the empty cell, got none")
         depth_m = np.empty(self._intrinsics.shape, np.float32)
         spread_m = np.empty(self._intrinsics.shape, np.float32)
-        kernels.conclude(
-            self._looks,
-            self._numbers,
-            self._means_m,
-            self._squares_m2,
-            SHARE_MIN,
-            PRIOR_FRAMES,
-            self._noise_per_m,
-            depth_m,
-            spread_m,
-        )
+        prior = plain(kernels.Prior(SHARE_MIN, PRIOR_FRAMES, self._noise_per_m))
+        kernels.conclude(self._modes, prior, depth_m, spread_m)
         return Reference(depth_m, spread_m, self.frames)

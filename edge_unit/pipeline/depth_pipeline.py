@@ -108,9 +108,7 @@ class DepthPipeline:
         depth_raw, known = self.intrinsics.check_depth(depth), self._static.images
         robot = self._moving.place(joints, joint_uncertainty_rad)
         mask = np.empty(self.intrinsics.shape, np.uint8)
-        foreground.foreground_mask(
-            depth_raw, known.room_raw, robot.near_raw, robot.span_raw, robot.columns, known.minimum_raw, mask
-        )
+        foreground.foreground_mask(depth_raw, known.room_raw, known.minimum_raw, robot.bundle, mask)
         self._static.halo.drop(depth_raw, mask)
         return mask.view(np.bool_)
 

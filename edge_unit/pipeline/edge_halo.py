@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.kernels import halo
+from geometry.kernels.bundles import plain
+from geometry.rendering.kernel_camera import camera_of
 from shared.camera import Intrinsics
 
 
@@ -16,6 +18,7 @@ class EdgeHalo:
     Attributes:
         runs: (R, 4) int32, the pixels as runs of neighbours, see `runs_of`.
         near_raw, span_raw: (N,) uint16, each pixel's band as its lower end and its length.
+        bundle: all three, for kernels.
     """
 
     def __init__(self, intrinsics: Intrinsics) -> None:
@@ -24,6 +27,7 @@ class EdgeHalo:
         self.runs = np.empty((0, 4), np.int32)
         self.near_raw = np.empty(0, np.uint16)
         self.span_raw = np.empty(0, np.uint16)
+        self.bundle = plain(halo.Halo(self.runs, self.near_raw, self.span_raw))
 
     def renew(self, cad_w: NDArray[np.float32], padding_m: float, base_m: float, noise_per_m: float) -> None:
         """Find the edges of `cad_w` (H, W), 1/z of the nearest surface, 0 for none.
@@ -32,27 +36,26 @@ class EdgeHalo:
         """
         camera = self._intrinsics
         nearest_w, farthest_w = np.empty(camera.shape, np.float32), np.empty(camera.shape, np.float32)
-        number = halo.spread_edges(
-            cad_w, padding_m, base_m, noise_per_m, camera.fx, camera.fy, nearest_w, farthest_w
-        )  # fmt: skip
+        margin = plain(halo.Margin(base_m, noise_per_m))
+        number = halo.spread_edges(cad_w, padding_m, margin, camera_of(camera), nearest_w, farthest_w)
         self._pixels = np.empty(number, np.int32)
         self.near_raw = np.empty(number, np.uint16)
         self.span_raw = np.empty(number, np.uint16)
         halo.halo_bands(
             nearest_w,
             farthest_w,
-            base_m,
-            noise_per_m,
+            margin,
             camera.depth_scale_m,
             self._pixels,
             self.near_raw,
             self.span_raw,
         )
         self.runs = runs_of(self._pixels, camera.width)
+        self.bundle = plain(halo.Halo(self.runs, self.near_raw, self.span_raw))
 
     def drop(self, depth_raw: NDArray[np.uint16], mask: NDArray[np.uint8]) -> None:
         """Take out of `mask` (H, at least W) what an edge explains."""
-        halo.drop_halo(depth_raw, 0, self.runs, self.near_raw, self.span_raw, mask)
+        halo.drop_halo(depth_raw, 0, self.bundle, mask)
 
     def lower(self, limit_raw: NDArray[np.uint16], out: NDArray[np.uint16]) -> None:
         """`limit_raw` (H, W) into `out`, but where a halo may hide something no farther than its near end."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.kernels import limits
+from geometry.kernels.bundles import plain
 from geometry.rendering import DepthBuffer, LinkDrawing, MeshBatch, hull_around
 from geometry.rendering.padded_hull import DISTANCE_MIN_M
 from shared.camera import Intrinsics
@@ -71,6 +72,7 @@ class RobotLayer:
         padding_m: (L,) float32, what the links are usually drawn with.
         near_raw, span_raw: (H, W) uint16, the band's lower end and its length.
         columns: (H, 2) int32, of each row the first column and the one after the last that may have a band.
+        bundle: all three, for kernels.
     """
 
     def __init__(self, intrinsics: Intrinsics, robot: Robot | None, padding_m: float) -> None:
@@ -85,10 +87,11 @@ class RobotLayer:
         self.near_raw = np.full(intrinsics.shape, limits.RAW_MAX, np.uint16)
         self.span_raw = np.zeros(intrinsics.shape, np.uint16)
         self.columns = np.zeros((intrinsics.height, 2), np.int32)
+        self.bundle = plain(limits.Band(self.near_raw, self.span_raw, self.columns))
 
     def forget(self) -> None:
         """Take the robot out: without joints nobody knows where it stands, and it is reported, not filtered."""
-        limits.clear_band(self.near_raw, self.span_raw, self.columns)
+        limits.clear_band(self.bundle)
         self._is_shown = False
 
     def draw(
@@ -114,17 +117,13 @@ class RobotLayer:
         if not drawing.draw(T_camera_link, growth_m, anew=not self._is_shown):
             return False
         limits.robot_band_raw(
-            drawing.buffer.window,
-            drawing.buffer.nearest_w,
-            drawing.buffer.farthest_w,
+            drawing.buffer.bundle,
             drawing.rectangles,
             drawing.all,
             noise_per_m,
             depth_m,
             self._intrinsics.depth_scale_m,
-            self.near_raw,
-            self.span_raw,
-            self.columns,
+            self.bundle,
         )
         self._is_shown = True
         return True
@@ -142,5 +141,4 @@ class BareRobot:
         """Lower `depth_m` (H, W) to the links at poses (L, 4, 4) where they are nearer."""
         drawing = self._drawing
         drawing.draw(T_camera_link, self._no_padding_m)
-        buffer = drawing.buffer
-        limits.lower_depth(buffer.window, buffer.nearest_w, drawing.rectangles, drawing.all, depth_m)
+        limits.lower_depth(drawing.buffer.bundle, drawing.rectangles, drawing.all, depth_m)

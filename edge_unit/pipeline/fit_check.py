@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.kernels import agreement
+from geometry.kernels.bundles import plain
 from shared.camera import Intrinsics
 from shared.settings import FilterSettings
 
@@ -55,8 +56,11 @@ class HealthCheck:
             depth_raw,
             static_raw,
             robot_near_raw,
-            settings.margin_base_m / scale_m,
-            settings.margin_noise_gain * noise_per_m * scale_m,
+            plain(
+                agreement.Tolerance(
+                    settings.margin_base_m / scale_m, settings.margin_noise_gain * noise_per_m * scale_m
+                )
+            ),
             STRIDE_PX,
             self._bins,
             self._tallies,

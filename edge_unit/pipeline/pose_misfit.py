@@ -14,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.kernels import misfit
+from geometry.kernels.agreement import Tolerance
+from geometry.kernels.bundles import plain
+from geometry.rendering.kernel_camera import camera_of
 from shared.camera import Intrinsics
 from shared.settings import FilterSettings
 from shared.transforms import from_xyz_rpy
@@ -57,6 +60,7 @@ class MisfitCheck:
 
     def __init__(self, intrinsics: Intrinsics) -> None:
         self._intrinsics = intrinsics
+        self._camera = camera_of(intrinsics)
         self._stride_px = max(round(intrinsics.width / COLUMNS_LOOKED_AT), 1)
         self._T_expected_there = _places(intrinsics.depth_scale_m)
         rows, columns = (len(range(self._stride_px // 2, size, self._stride_px)) for size in intrinsics.shape)
@@ -74,21 +78,20 @@ class MisfitCheck:
         camera = self._intrinsics
         scale_m = camera.depth_scale_m
         noise_per_raw2 = camera.disparity_noise_m(settings.stereo_subpixel_px) * scale_m
-        projection = (camera.fx, camera.fy), (camera.cx, camera.cy)
+        margin = plain(Tolerance(settings.margin_base_m / scale_m, settings.margin_noise_gain * noise_per_raw2))
+        scale = plain(Tolerance(SCALE_BASE_M / scale_m, SCALE_NOISE_GAIN * noise_per_raw2))
         compared = misfit.compared_points(
             depth_raw,
             static_raw,
             robot_near_raw,
-            *projection,
+            self._camera,
+            margin,
             self._stride_px,
-            settings.margin_base_m / scale_m,
-            settings.margin_noise_gain * noise_per_raw2,
             self._points_raw,
             self._tallies,
         )
-        base_raw, per_raw2 = SCALE_BASE_M / scale_m, SCALE_NOISE_GAIN * noise_per_raw2
         sums = [
-            misfit.misfit_there(self._points_raw, compared, static_raw, *projection, T, base_raw, per_raw2)
+            misfit.misfit_there(self._points_raw, compared, static_raw, self._camera, T, scale)
             for T in self._T_expected_there
         ]
         here, (ahead, back) = sums[0] / max(compared, 1), np.reshape(sums[1:], (6, 2)).T / max(compared, 1)

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.kernels import align
+from geometry.kernels.bundles import plain
+from geometry.rendering.kernel_camera import camera_of
 from shared.camera import Intrinsics
 from shared.errors import InputError
 from shared.transforms import Transform, from_xyz_rpy
@@ -92,8 +94,9 @@ class Refiner:
     ) -> None:
         self._intrinsics = intrinsics
         self._T_world_camera = T_world_camera
-        self._expected_m = np.ascontiguousarray(expected_m, np.float32)
-        self._obliqueness, self._normals = planes_of(self._expected_m, intrinsics)
+        expected_m = np.ascontiguousarray(expected_m, np.float32)
+        self._expected = plain(align.Planes(expected_m, *planes_of(expected_m, intrinsics)))
+        self._camera = camera_of(intrinsics)
         self._noise_per_m = noise_per_m
 
     @property
@@ -174,17 +177,8 @@ class _Search:
     def cost(self, T_expected_there: Transform, coarseness: float) -> tuple[float, NDArray[np.float32]]:
         """The cost of a pose, and the points' distances from the planes (N,) in metres."""
         r = self._refiner
-        camera = r._intrinsics
-        cost = align.plane_cost(
-            self._points_m,
-            r._expected_m,
-            r._obliqueness,
-            (camera.fx, camera.fy),
-            (camera.cx, camera.cy),
-            T_expected_there,
-            np.float32(coarseness) * self._scale_m,
-            self._distances_m,
-        )
+        measured = plain(align.Measured(self._points_m, np.float32(coarseness) * self._scale_m))
+        cost = align.plane_cost(measured, r._expected, r._camera, T_expected_there, self._distances_m)
         return cost, self._distances_m
 
     def run(self) -> Transform:
@@ -208,19 +202,9 @@ class _Search:
     def _towards_planes(self, T: Transform, coarseness: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """A step of Gauss and Newton (6,), and the directions (K, 6) in which the planes leave the pose free."""
         r = self._refiner
-        camera = r._intrinsics
         information, gradient = np.empty((6, 6)), np.empty(6)
-        align.normal_equations(
-            self._points_m,
-            r._expected_m,
-            r._normals,
-            (camera.fx, camera.fy),
-            (camera.cx, camera.cy),
-            T,
-            np.float32(coarseness) * self._scale_m,
-            information,
-            gradient,
-        )
+        measured = plain(align.Measured(self._points_m, np.float32(coarseness) * self._scale_m))
+        align.normal_equations(measured, r._expected, r._camera, T, information, gradient)
         values, axes = np.linalg.eigh(information * np.outer(UNITS, UNITS))
         firm = values > FIRMNESS_MIN * values.max()
         step = -(axes[:, firm] / values[firm]) @ (axes[:, firm].T @ (gradient * UNITS))

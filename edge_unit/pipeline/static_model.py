@@ -12,6 +12,7 @@ from edge_unit.pipeline.background_model import Reference
 from edge_unit.pipeline.edge_halo import EdgeHalo
 from edge_unit.pipeline.expected_depth import StaticLayer
 from geometry.kernels import limits
+from geometry.kernels.bundles import plain
 from shared.camera import Intrinsics
 from shared.cell import Cell
 from shared.errors import InputError
@@ -131,12 +132,16 @@ class StaticModel:
             w,
             reference_m,
             spread_m,
-            settings.margin_base_m,
-            cad_noise_per_m,
-            settings.reference_margin_base_m,
-            settings.reference_spread_gain,
-            settings.range_max_m,
-            camera.depth_scale_m,
+            plain(
+                limits.Margins(
+                    settings.margin_base_m,
+                    cad_noise_per_m,
+                    settings.reference_margin_base_m,
+                    settings.reference_spread_gain,
+                    settings.range_max_m,
+                    camera.depth_scale_m,
+                )
+            ),
             raw,
         )
         radius_px = round(settings.edge_radius_px * camera.width / EDGE_RADIUS_WIDTH_PX)

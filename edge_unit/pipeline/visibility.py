@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from edge_unit.pipeline.voxelizer import Voxels
 from geometry.kernels import seen as kernels
+from geometry.kernels.bundles import plain
+from geometry.rendering.kernel_camera import camera_of
 from geometry.rendering.mesh_renderer import NEAR_PLANE_M
 from shared.camera import Intrinsics
 from shared.lattice import Lattice, block_lattice
@@ -84,32 +86,21 @@ class Visibility:
         self._intrinsics = intrinsics
         self._share_min = share_min
         self._noise_per_m = SIGMAS * noise_per_m
-        self._blocks = np.empty(self.lattice.cell_count, np.int32)
-        self._views = np.empty((self.lattice.cell_count, 5), np.int32)
+        count = self.lattice.cell_count
+        self._views = plain(kernels.Views(np.empty(count, np.int32), np.empty((count, 5), np.int32)))
         self._seen = np.zeros(self.lattice.cell_count, np.uint8)
-        self._rows_apart = max(intrinsics.height // ROWS_LOOKED_AT, 1)
-        self._reach_raw = np.empty((-(-intrinsics.height // self._rows_apart), intrinsics.width), np.uint16)
+        rows_apart = max(intrinsics.height // ROWS_LOOKED_AT, 1)
+        reach_raw = np.empty((-(-intrinsics.height // rows_apart), intrinsics.width), np.uint16)
+        self._looking = plain(kernels.Looking(rows_apart, reach_raw))
         self.place(T_world_camera)
 
     def place(self, T_world_camera: Transform) -> None:
         """The camera stands elsewhere from now on."""
-        camera = self._intrinsics
+        camera, lattice = self._intrinsics, self.lattice
+        blocks = kernels.Blocks(np.array(lattice.shape, np.int32), lattice.voxel_size_m, np.array(lattice.origin_m))
+        measuring = kernels.Measuring(NEAR_PLANE_M, self._noise_per_m, camera.depth_scale_m)
         self._number = kernels.block_views(
-            np.array(self.lattice.shape, np.int32),
-            self.lattice.voxel_size_m,
-            inverse(T_world_camera),
-            np.array(self.lattice.origin_m),
-            camera.fx,
-            camera.fy,
-            camera.cx,
-            camera.cy,
-            camera.width,
-            camera.height,
-            NEAR_PLANE_M,
-            self._noise_per_m,
-            camera.depth_scale_m,
-            self._blocks,
-            self._views,
+            plain(blocks), inverse(T_world_camera), camera_of(camera), plain(measuring), self._views
         )
 
     def look(
@@ -123,12 +114,10 @@ class Visibility:
             depth_raw,
             static_limit_raw,
             robot_near_raw,
-            self._blocks,
             self._views,
             self._number,
             self._share_min,
-            self._rows_apart,
-            self._reach_raw,
+            self._looking,
             self._seen,
         )
         return SeenBlocks(self._seen.copy(), self.lattice)

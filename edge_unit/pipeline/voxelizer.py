@@ -13,6 +13,7 @@ from edge_unit.pipeline.edge_halo import EdgeHalo
 from edge_unit.pipeline.expected_depth import RobotLayer
 from edge_unit.pipeline.stage_times import StageRunner
 from geometry.kernels import density, points, voxelize
+from geometry.kernels.bundles import plain
 from shared.camera import Intrinsics
 from shared.lattice import Lattice
 from shared.settings import FilterSettings
@@ -60,19 +61,29 @@ class Voxelizer:
     ) -> None:
         self.lattice = lattice
         self._intrinsics = intrinsics
-        self._settings = settings
         most = min(intrinsics.width * intrinsics.height, lattice.cell_count)
         self._shape = np.array(lattice.shape, np.int32)
         self._counts = np.zeros(int(np.prod(self._shape + 2, dtype=np.int64)) + 1, np.uint32)
         stride = -(-intrinsics.width // voxelize.PIXELS_PER_WORD) * voxelize.PIXELS_PER_WORD
         # Behind the picture's last column it stays zero.
-        self._mask = np.zeros((points.ROWS_AT_ONCE, stride), np.uint8)
-        self._slots = np.empty(intrinsics.width, np.int32)
+        mask = np.zeros((points.ROWS_AT_ONCE, stride), np.uint8)
+        self._mask = plain(voxelize.Mask(mask.view(np.uint64), mask))
         self._touched = np.empty(most + 1, np.uint32)
+        self._counter = plain(voxelize.Counter(self._counts, self._touched, np.empty(intrinsics.width, np.int32)))
         self._kept = np.empty(most + 1, np.uint32)
         self._kept_counts = np.empty(most + 1, np.uint32)
-        self._scratch = np.empty((6, density.AT_ONCE))
-        self._keys = np.empty(density.AT_ONCE, np.uint32)
+        scratch, keys = np.empty((6, density.AT_ONCE)), np.empty(density.AT_ONCE, np.uint32)
+        self._judged = plain(density.Kept(self._kept, self._kept_counts, scratch, keys))
+        self._rule = plain(
+            density.Rule(
+                settings.density_model == "angular",
+                settings.density_rule == "single",
+                settings.occupancy_threshold,
+                settings.own_share_min,
+                settings.support_area_max_m2,
+                settings.support_points_min,
+            )
+        )
         self.place(T_world_camera)
 
     def place(self, T_world_camera: Transform) -> None:
@@ -82,14 +93,27 @@ class Voxelizer:
         per_raw = voxels_per_m * camera.depth_scale_m
         u = (np.arange(camera.width) - camera.cx) / camera.fx
         v = (np.arange(camera.height) - camera.cy) / camera.fy
-        self._column_rays = (per_raw[:, :1] * u + per_raw[:, 2:]).astype(np.float32)
-        self._row_rays = (v[:, None] * per_raw[:, 1]).astype(np.float32)
-        self._origin = ((T_world_camera[:3, 3] - lattice.origin_m) / lattice.voxel_size_m).astype(np.float32)
+        self._grid = plain(
+            voxelize.Grid(
+                column_rays=(per_raw[:, :1] * u + per_raw[:, 2:]).astype(np.float32),
+                row_rays=(v[:, None] * per_raw[:, 1]).astype(np.float32),
+                origin=((T_world_camera[:3, 3] - lattice.origin_m) / lattice.voxel_size_m).astype(np.float32),
+                shape=self._shape,
+            )
+        )
         T_camera_world = inverse(T_world_camera)
-        self._first_centre_camera_m = apply(T_camera_world, lattice.centres(np.zeros(3)))
-        self._axes_camera = np.ascontiguousarray(T_camera_world[:3, :3] * lattice.voxel_size_m)
-        self._degrees_per_column = math.degrees(2.0 * math.atan(camera.width / (2.0 * camera.fx))) / camera.width
-        self._degrees_per_row = math.degrees(2.0 * math.atan(camera.height / (2.0 * camera.fy))) / camera.height
+        self._view = plain(
+            density.View(
+                self._shape,
+                lattice.voxel_size_m,
+                first_centre_camera_m=apply(T_camera_world, lattice.centres(np.zeros(3))),
+                axes_camera=np.ascontiguousarray(T_camera_world[:3, :3] * lattice.voxel_size_m),
+                fx=camera.fx,
+                fy=camera.fy,
+                degrees_per_column=math.degrees(2.0 * math.atan(camera.width / (2.0 * camera.fx))) / camera.width,
+                degrees_per_row=math.degrees(2.0 * math.atan(camera.height / (2.0 * camera.fy))) / camera.height,
+            )
+        )
 
     def voxels(
         self,
@@ -119,51 +143,18 @@ class Voxelizer:
         return points.count_foreground(
             depth_raw,
             room_raw,
-            robot.near_raw,
-            robot.span_raw,
-            robot.columns,
             minimum_raw,
-            halo.runs,
-            halo.near_raw,
-            halo.span_raw,
-            self._column_rays,
-            self._row_rays,
-            self._origin,
-            self._shape,
-            self._mask.view(np.uint64),
+            robot.bundle,
+            halo.bundle,
+            self._grid,
             self._mask,
-            self._slots,
-            self._counts,
-            self._touched,
+            self._counter,
         )
 
     def _keep_dense(self, found: int) -> Voxels:
         """Return the voxels that hold enough points, and forget all `found` of them."""
-        settings = self._settings
         # In the order of memory: judging them is then several times as fast, and the kept ones come sorted.
         self._touched[:found].sort()
-        kept = density.keep_dense(
-            self._counts,
-            self._touched,
-            found,
-            self._shape,
-            self.lattice.voxel_size_m,
-            self._first_centre_camera_m,
-            self._axes_camera,
-            self._intrinsics.fx,
-            self._intrinsics.fy,
-            self._degrees_per_column,
-            self._degrees_per_row,
-            settings.density_model == "angular",
-            settings.density_rule == "single",
-            settings.occupancy_threshold,
-            settings.own_share_min,
-            settings.support_area_max_m2,
-            settings.support_points_min,
-            self._scratch,
-            self._keys,
-            self._kept,
-            self._kept_counts,
-        )
+        kept = density.keep_dense(self._counts, self._touched, found, self._view, self._rule, self._judged)
         voxelize.forget(self._counts, self._touched, found)
         return Voxels(self._kept[:kept].copy(), self._kept_counts[:kept].copy(), self.lattice)

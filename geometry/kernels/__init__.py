@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The arithmetic of a frame: pure functions on arrays, compiled by numba, all memory handed in.
 
-They import only numpy, numba, math and one another; each has a slow twin in plain numpy in the tests.
+They import only numpy, numba, math and one another, and take bundles of what belongs together; each has a slow twin in
+plain numpy in the tests.
 In the order of the flow:
 
     jit         how kernels are compiled
+    bundles     how bundles of arrays and numbers are handed to kernels
     int32       integers of 32 bits that stay so
     pinhole     a point and its place in the picture
     forward     where the links stand, and how far they may be off (Algorithm 5)

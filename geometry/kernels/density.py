@@ -9,6 +9,7 @@ around decide, and a voxel by itself only needs a small share.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,60 @@ surface that crosses the neighbourhood fills about nine."""
 
 AT_ONCE = 256
 """So many voxels are located before they are judged: enough for the vectoriser, and they stay in the first cache."""
+
+
+class View(NamedTuple):
+    """The voxels of a lattice of `shape` (3,) before one camera.
+
+    `first_centre_camera_m` (3,) is the middle of voxel (0, 0, 0) in the camera frame, and `axes_camera` (3, 3) has as
+    columns the steps to the next voxel along each lattice axis.
+    """
+
+    shape: NDArray[np.int32]
+    voxel_size_m: float
+    first_centre_camera_m: NDArray[np.float64]
+    axes_camera: NDArray[np.float64]
+    fx: float
+    fy: float
+    degrees_per_column: float
+    degrees_per_row: float
+
+
+class Rule(NamedTuple):
+    """What a voxel must hold.
+
+    `angular` takes the paper's Algorithm 6 for a full one. `single` is its Algorithm 7: a voxel's own count against
+    `threshold` of the full count. Else the 27-neighbourhood is held against `threshold` of the full count of at most
+    `support_area_max_m2`, but no less than `support_points_min` or `FLOOR_VOXELS` full voxels, and the voxel's own
+    against `own_share_min`.
+    """
+
+    angular: bool
+    single: bool
+    threshold: float
+    own_share_min: float
+    support_area_max_m2: float
+    support_points_min: float
+
+
+class Kept(NamedTuple):
+    """`keys` and `counts` of the voxels that are kept, at least one longer than may be.
+
+    Scratch of those that are judged: `judged` (6, AT_ONCE) and `judged_keys` (AT_ONCE,).
+    """
+
+    keys: NDArray[np.uint32]
+    counts: NDArray[np.uint32]
+    judged: NDArray[np.float64]
+    judged_keys: NDArray[np.uint32]
+
+
+class Asked(NamedTuple):
+    """What a few voxels hold with their neighbours, and what they must hold by themselves and with them."""
+
+    around: NDArray[np.float64]
+    own_needed: NDArray[np.float64]
+    needed: NDArray[np.float64]
 
 
 @kernel
@@ -54,9 +109,7 @@ def neighbourhood_count(
 @kernel
 def locate(
     slots: NDArray[np.uint32],
-    shape: NDArray[np.int32],
-    first_centre_camera_m: NDArray[np.float64],
-    axes_camera: NDArray[np.float64],
+    view: View,
     keys: NDArray[np.uint32],
     z_m: NDArray[np.float64],
     distance_m: NDArray[np.float64],
@@ -66,6 +119,8 @@ def locate(
     Written for the vectoriser: without divisions of integers, which it cannot do. A slot is below 2**28: the half that
     is added outweighs the rounding of the inverse.
     """
+    view = View(*view)
+    shape, first_centre_camera_m, axes_camera = view.shape, view.first_centre_camera_m, view.axes_camera
     ny, nz = np.float64(shape[1]), np.float64(shape[2])
     per_z, per_y = 1.0 / (nz + 2.0), 1.0 / (ny + 2.0)
     x0, y0, z0 = first_centre_camera_m[0], first_centre_camera_m[1], first_centre_camera_m[2]
@@ -88,40 +143,27 @@ def locate(
 
 
 @kernel
-def fill_pinhole(size_m: float, z_m: NDArray[np.float64], fx: float, fy: float, full: NDArray[np.float64]) -> None:
+def fill_pinhole(view: View, z_m: NDArray[np.float64], full: NDArray[np.float64]) -> None:
     """`expected_pinhole` of each; alone in its function, it is vectorised."""
+    size_m, fx, fy = view.voxel_size_m, view.fx, view.fy
     for i in range(len(z_m)):
         full[i] = expected_pinhole(size_m, z_m[i], fx, fy)
 
 
 @kernel
-def fill_angular(
-    size_m: float,
-    distance_m: NDArray[np.float64],
-    degrees_per_column: float,
-    degrees_per_row: float,
-    full: NDArray[np.float64],
-) -> None:
+def fill_angular(view: View, distance_m: NDArray[np.float64], full: NDArray[np.float64]) -> None:
     """`expected_angular` of each."""
     for i in range(len(distance_m)):
-        full[i] = expected_angular(size_m, distance_m[i], degrees_per_column, degrees_per_row)
+        full[i] = expected_angular(view.voxel_size_m, distance_m[i], view.degrees_per_column, view.degrees_per_row)
 
 
 @kernel
-def demand(
-    full: NDArray[np.float64],
-    single: bool,
-    threshold: float,
-    share: float,
-    points_min: float,
-    own_share_min: float,
-    own_needed: NDArray[np.float64],
-    needed: NDArray[np.float64],
-) -> None:
+def demand(full: NDArray[np.float64], rule: Rule, share: float, asked: Asked) -> None:
     """What a voxel must hold by itself, and with its 26 neighbours; `share` of a full one is asked at most."""
-    own_share = threshold if single else own_share_min
-    around_share = 0.0 if single else threshold * share
-    floor_points, floor_voxels = (0.0, 0.0) if single else (points_min, FLOOR_VOXELS)
+    own_needed, needed = asked.own_needed, asked.needed
+    own_share = rule.threshold if rule.single else rule.own_share_min
+    around_share = 0.0 if rule.single else rule.threshold * share
+    floor_points, floor_voxels = (0.0, 0.0) if rule.single else (rule.support_points_min, FLOOR_VOXELS)
     for i in range(len(full)):
         own_needed[i] = own_share * full[i]
         needed[i] = max(around_share * full[i], min(floor_points, floor_voxels * full[i]))
@@ -145,13 +187,12 @@ def pick(
     counts: NDArray[np.uint32],
     slots: NDArray[np.uint32],
     keys: NDArray[np.uint32],
-    around: NDArray[np.float64],
-    own_needed: NDArray[np.float64],
-    needed: NDArray[np.float64],
+    asked: Asked,
     kept: NDArray[np.uint32],
     kept_counts: NDArray[np.uint32],
 ) -> int:
     """List the keys and counts of those `slots` that hold what is needed; returns how many."""
+    around, own_needed, needed = asked
     # Unsigned, for a signed index is tested for counting from the end.
     number = np.uint64(0)
     for i in range(len(slots)):
@@ -165,53 +206,30 @@ def pick(
 
 @kernel
 def keep_dense(
-    counts: NDArray[np.uint32],
-    touched: NDArray[np.uint32],
-    found: int,
-    shape: NDArray[np.int32],
-    voxel_size_m: float,
-    first_centre_camera_m: NDArray[np.float64],
-    axes_camera: NDArray[np.float64],
-    fx: float,
-    fy: float,
-    degrees_per_column: float,
-    degrees_per_row: float,
-    angular: bool,
-    single: bool,
-    threshold: float,
-    own_share_min: float,
-    support_area_max_m2: float,
-    support_points_min: float,
-    scratch: NDArray[np.float64],
-    keys: NDArray[np.uint32],
-    kept: NDArray[np.uint32],
-    kept_counts: NDArray[np.uint32],
+    counts: NDArray[np.uint32], touched: NDArray[np.uint32], found: int, view: View, rule: Rule, kept: Kept
 ) -> int:
-    """List the touched voxels that are dense enough: their keys in `kept`, in the order of `touched`; returns how many.
+    """List the touched voxels that are dense enough in `kept`, in the order of `touched`; returns how many.
 
-    `touched` are slots of the counter with its rim; in ascending order, neighbours are found in the cache.
-    `first_centre_camera_m` (3,) is the middle of voxel (0, 0, 0) in the camera frame and `axes_camera` (3, 3) has as
-    columns the steps to the next voxel along each lattice axis. `single` is the paper's Algorithm 7: a voxel's own
-    count against `threshold` of the full count. Else the 27-neighbourhood is held against `threshold` of the full count
-    of at most `support_area_max_m2`, but no less than `support_points_min` or `FLOOR_VOXELS` full voxels, and the
-    voxel's own against `own_share_min`. Out: `kept` and `kept_counts`, at least one longer than `found`.
-    `scratch` (6, AT_ONCE), `keys` (AT_ONCE,).
+    The `found` of `touched` are slots of the counter with its rim; in ascending order, neighbours are found in the
+    cache.
     """
-    slots_per_y = np.uint64(shape[2] + 2)
-    slots_per_x = slots_per_y * np.uint64(shape[1] + 2)
-    share = min(support_area_max_m2 / (voxel_size_m * voxel_size_m), 1.0)
-    z_m, distance_m, full = scratch[0], scratch[1], scratch[2]
-    own_needed, needed, around = scratch[3], scratch[4], scratch[5]
+    view, rule, kept = View(*view), Rule(*rule), Kept(*kept)
+    slots_per_y = np.uint64(view.shape[2] + 2)
+    slots_per_x = slots_per_y * np.uint64(view.shape[1] + 2)
+    share = min(rule.support_area_max_m2 / (view.voxel_size_m * view.voxel_size_m), 1.0)
+    judged, keys = kept.judged, kept.judged_keys
+    z_m, distance_m, full = judged[0], judged[1], judged[2]
+    asked = Asked(judged[3], judged[4], judged[5])
     number = 0
     for first in range(0, found, AT_ONCE):
         slots = touched[first : min(first + AT_ONCE, found)]
         count = len(slots)
-        locate(slots, shape, first_centre_camera_m, axes_camera, keys, z_m, distance_m)
-        if angular:
-            fill_angular(voxel_size_m, distance_m[:count], degrees_per_column, degrees_per_row, full)
+        locate(slots, view, keys, z_m, distance_m)
+        if rule.angular:
+            fill_angular(view, distance_m[:count], full)
         else:
-            fill_pinhole(voxel_size_m, z_m[:count], fx, fy, full)
-        demand(full[:count], single, threshold, share, support_points_min, own_share_min, own_needed, needed)
-        sum_around(counts, slots, slots_per_y, slots_per_x, around)
-        number += pick(counts, slots, keys, around, own_needed, needed, kept[number:], kept_counts[number:])
+            fill_pinhole(view, z_m[:count], full)
+        demand(full[:count], rule, share, asked)
+        sum_around(counts, slots, slots_per_y, slots_per_x, asked.around)
+        number += pick(counts, slots, keys, asked, kept.keys[number:], kept.counts[number:])
     return number

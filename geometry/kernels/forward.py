@@ -8,11 +8,47 @@ a millisecond a frame, and three times that in a cold cache. Arrays are those of
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geometry.kernels.jit import kernel
+
+
+class Moving(NamedTuple):
+    """The moving joints: what `shared.kinematics.LinkTable` has of each of J."""
+
+    parent: NDArray[np.int64]
+    dof: NDArray[np.int64]
+    multiplier: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    is_turning: NDArray[np.bool_]
+    axis: NDArray[np.float64]
+    fixed: NDArray[np.float64]
+    sine: NDArray[np.float64]
+    versine: NDArray[np.float64]
+    shift: NDArray[np.float64]
+
+
+class Carried(NamedTuple):
+    """The links that hang on them: what it has of each of L."""
+
+    body: NDArray[np.int64]
+    T_body_link: NDArray[np.float64]
+    chain: NDArray[np.bool_]
+    corners: NDArray[np.float64]
+
+
+class Stand(NamedTuple):
+    """Where they stand: `poses` (L, 4, 4) `T_camera_link`, and `bodies` (J + 1, 4, 4) `T_camera_body`, the base last.
+
+    `local` (4, 4) is scratch.
+    """
+
+    poses: NDArray[np.float64]
+    bodies: NDArray[np.float64]
+    local: NDArray[np.float64]
 
 
 @kernel
@@ -26,27 +62,12 @@ def multiply(a: NDArray[np.float64], b: NDArray[np.float64], out: NDArray[np.flo
 
 @kernel
 def place_links(
-    joints: NDArray[np.float64],
-    T_camera_base: NDArray[np.float64],
-    parent: NDArray[np.int64],
-    dof: NDArray[np.int64],
-    multiplier: NDArray[np.float64],
-    offset: NDArray[np.float64],
-    is_turning: NDArray[np.bool_],
-    fixed: NDArray[np.float64],
-    sine: NDArray[np.float64],
-    versine: NDArray[np.float64],
-    shift: NDArray[np.float64],
-    body: NDArray[np.int64],
-    T_body_link: NDArray[np.float64],
-    local: NDArray[np.float64],
-    bodies: NDArray[np.float64],
-    poses: NDArray[np.float64],
+    joints: NDArray[np.float64], T_camera_base: NDArray[np.float64], moving: Moving, carried: Carried, stand: Stand
 ) -> None:
-    """Fill `poses` (L, 4, 4) with `T_camera_link` and `bodies` (J + 1, 4, 4) with `T_camera_body`, the base last.
-
-    `joints` (n,) rad or m; `local` (4, 4) is scratch.
-    """
+    """Fill `stand` at joint positions (n,), rad or m."""
+    moving, carried, stand = Moving(*moving), Carried(*carried), Stand(*stand)
+    parent, dof, multiplier, offset, is_turning, _, fixed, sine, versine, shift = moving
+    body, bodies, local = carried.body, stand.bodies, stand.local
     base = len(parent)
     bodies[base] = T_camera_base
     for k in range(base):
@@ -58,26 +79,24 @@ def place_links(
                 local[i, j] = fixed[k, i, j] + sin * sine[k, i, j] + versin * versine[k, i, j] + value * shift[k, i, j]
         multiply(bodies[parent[k] if parent[k] >= 0 else base], local, bodies[k])
     for m in range(len(body)):
-        multiply(bodies[body[m] if body[m] >= 0 else base], T_body_link[m], poses[m])
+        multiply(bodies[body[m] if body[m] >= 0 else base], carried.T_body_link[m], stand.poses[m])
 
 
 @kernel
 def displace_links(
     uncertainty: NDArray[np.float64],
-    dof: NDArray[np.int64],
-    multiplier: NDArray[np.float64],
-    is_turning: NDArray[np.bool_],
-    axis: NDArray[np.float64],
-    chain: NDArray[np.bool_],
-    corners: NDArray[np.float64],
-    bodies: NDArray[np.float64],
-    poses: NDArray[np.float64],
+    moving: Moving,
+    carried: Carried,
+    stand: Stand,
     displacement_m: NDArray[np.float64],
 ) -> None:
     """How far (L,) any point of each link moves at most when joints are off by `uncertainty` (n,), rad or m.
 
-    `bodies` and `poses` are those of `place_links`; see `shared.kinematics.Robot.displacement_m`.
+    `stand` is what `place_links` filled; see `shared.kinematics.Robot.displacement_m`.
     """
+    moving, carried, stand = Moving(*moving), Carried(*carried), Stand(*stand)
+    dof, multiplier, is_turning, axis = moving.dof, moving.multiplier, moving.is_turning, moving.axis
+    chain, corners, poses, bodies = carried.chain, carried.corners, stand.poses, stand.bodies
     for m in range(len(poses)):
         displacement_m[m] = 0.0
         for k in range(len(dof)):

@@ -9,34 +9,54 @@ by it: what stands well before or behind the edge is seen as ever.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geometry.kernels.jit import kernel
 from geometry.kernels.limits import RAW_MAX, less_noise
+from geometry.kernels.pinhole import Camera
 
 STEP_SHARE = 0.5
 """A step of half a margin is an edge: beyond a smaller one the margin behind it holds the halo, too."""
+
+
+class Margin(NamedTuple):
+    """What an edge's depth may be off by: `base_m + noise_per_m * z**2`."""
+
+    base_m: float
+    noise_per_m: float
+
+
+class Halo(NamedTuple):
+    """The pixels that have a halo, in `runs` (R, 4) of neighbours in a row, and the band of raw depths of each.
+
+    A run is its row, its first column, and the first of its bands in `near_raw` and `span_raw` (N,), lower end and
+    length, and the one after its last.
+    """
+
+    runs: NDArray[np.int32]
+    near_raw: NDArray[np.uint16]
+    span_raw: NDArray[np.uint16]
 
 
 @kernel
 def spread_edges(
     cad_w: NDArray[np.float32],
     padding_m: float,
-    base_m: float,
-    noise_per_m: float,
-    fx: float,
-    fy: float,
+    margin: Margin,
+    camera: Camera,
     nearest_w: NDArray[np.float32],
     farthest_w: NDArray[np.float32],
 ) -> int:
     """Let the edges of `cad_w` (H, W), 1/z of the nearest surface and 0 for none, reach over what lies behind them.
 
     An edge reaches `padding_m` at its own depth. It is a pixel beside one that lies farther by `STEP_SHARE` of its
-    margin `base + noise * z**2`. Out (H, W): 1/z of the nearest and of the farthest edge that reaches over a pixel,
+    margin. Out (H, W): 1/z of the nearest and of the farthest edge that reaches over a pixel,
     0 where none does. Returns the number of pixels that one reaches.
     """
+    margin, camera = Margin(*margin), Camera(*camera)
     height, width = cad_w.shape
     nearest_w[:] = 0.0
     farthest_w[:] = 0.0
@@ -47,18 +67,18 @@ def spread_edges(
             if not w > 0.0:
                 continue
             z = 1.0 / w
-            behind_w = np.float32(1.0 / (z + STEP_SHARE * (base_m + noise_per_m * z * z)))
+            behind_w = np.float32(1.0 / (z + STEP_SHARE * (margin.base_m + margin.noise_per_m * z * z)))
             lowest_w = min(
                 min(cad_w[y, max(x - 1, 0)], cad_w[y, min(x + 1, width - 1)]),
                 min(cad_w[max(y - 1, 0), x], cad_w[min(y + 1, height - 1), x]),
             )
             if not lowest_w < behind_w:
                 continue
-            reach_rows = padding_m * fy * w
+            reach_rows = padding_m * camera.fy * w
             rows = int(min(reach_rows, float(height)))
             for row in range(max(y - rows, 0), min(y + rows, height - 1) + 1):
                 share = (row - y) / reach_rows if reach_rows > 0.0 else 0.0
-                columns = int(min(padding_m * fx * w * math.sqrt(max(1.0 - share * share, 0.0)), float(width)))
+                columns = int(min(padding_m * camera.fx * w * math.sqrt(max(1.0 - share * share, 0.0)), float(width)))
                 for column in range(max(x - columns, 0), min(x + columns, width - 1) + 1):
                     if cad_w[row, column] < behind_w:
                         if nearest_w[row, column] == 0.0:
@@ -73,8 +93,7 @@ def spread_edges(
 def halo_bands(
     nearest_w: NDArray[np.float32],
     farthest_w: NDArray[np.float32],
-    base_m: float,
-    noise_per_m: float,
+    margin: Margin,
     depth_scale_m: float,
     pixels: NDArray[np.int32],
     near_raw: NDArray[np.uint16],
@@ -85,6 +104,7 @@ def halo_bands(
     From the nearest edge less its margin to the farthest edge plus its margin, as lower end and length. Out (N,), N
     being what `spread_edges` returned; a pixel is `y * W + x`.
     """
+    base_m, noise_per_m = Margin(*margin)
     height, width = nearest_w.shape
     number = 0
     for y in range(height):
@@ -115,20 +135,12 @@ def drop_run(
 
 
 @kernel
-def drop_halo(
-    depth_raw: NDArray[np.uint16],
-    top: int,
-    runs: NDArray[np.int32],
-    near_raw: NDArray[np.uint16],
-    span_raw: NDArray[np.uint16],
-    mask: NDArray[np.uint8],
-) -> None:
+def drop_halo(depth_raw: NDArray[np.uint16], top: int, halo: Halo, mask: NDArray[np.uint8]) -> None:
     """Take the pixels of `depth_raw` (H, W) that lie in their halo's band out of `mask` (H, at least W).
 
-    Row 0 of both is row `top` of the picture. The pixels that have a halo come in `runs` (R, 4) of neighbours in a row:
-    the row, the first column, and the first of the run's bands in `near_raw` and `span_raw` (N,) and the one after its
-    last.
+    Row 0 of both is row `top` of the picture.
     """
+    runs, near_raw, span_raw = Halo(*halo)
     for i in range(len(runs)):
         y, first, start, end = runs[i]
         last = first + end - start

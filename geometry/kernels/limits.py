@@ -7,18 +7,46 @@ Limits are uint16 in the camera's own units, so that the filter compares without
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geometry.kernels.jit import kernel
-from geometry.kernels.rasterize import NOTHING_FARTHEST, NOTHING_NEAREST, span_of_row
+from geometry.kernels.rasterize import NOTHING_FARTHEST, NOTHING_NEAREST, Buffer, span_of_row
 
 RAW_MAX = 65535
 """The largest raw depth."""
 
 ZERO, ONE, TOP = np.float32(0.0), np.float32(1.0), np.float32(RAW_MAX)
 """In float32, for one float64 among them would halve what the vector unit does at once."""
+
+
+class Margins(NamedTuple):
+    """By how much a limit lies before what is expected.
+
+    Before a CAD surface `cad_base_m` and `cad_noise_per_m * z**2`, before a learned one `reference_base_m` and its
+    spread times `reference_gain`; at `range_max_m` where neither is known.
+    """
+
+    cad_base_m: float
+    cad_noise_per_m: float
+    reference_base_m: float
+    reference_gain: float
+    range_max_m: float
+    depth_scale_m: float
+
+
+class Band(NamedTuple):
+    """The raw depths of each pixel that belong to the robot: `near_raw` and `span_raw` (H, W), lower end and length.
+
+    So stored, the filter needs one unsigned compare. Where there is no robot the band is empty: its lower end is where
+    no limit reaches. `columns` (H, 2) holds of each row the first column and the one after the last that have a band.
+    """
+
+    near_raw: NDArray[np.uint16]
+    span_raw: NDArray[np.uint16]
+    columns: NDArray[np.int32]
 
 
 @kernel
@@ -36,20 +64,15 @@ def static_limit_raw(
     cad_w: NDArray[np.float32],
     reference_m: NDArray[np.float32],
     spread_m: NDArray[np.float32],
-    cad_base_m: float,
-    cad_noise_per_m: float,
-    reference_base_m: float,
-    reference_gain: float,
-    range_max_m: float,
-    depth_scale_m: float,
+    margins: Margins,
     limit_raw: NDArray[np.uint16],
 ) -> None:
     """Per pixel, the raw depth at which what is measured is no longer nearer than all that stands still.
 
-    The nearer of the CAD surface, less `base + noise * z**2` with `cad_w` = 1/z (H, W), and the learned surface,
-    less `base + gain * spread` with `reference_m`, `spread_m` (H, W), NaN where nothing was learned;
-    `range_max_m` where neither is known. Out: `limit_raw` (H, W), rounded down.
+    The nearer of the CAD surface, `cad_w` = 1/z (H, W), and the learned surface, `reference_m` and `spread_m` (H, W),
+    NaN where nothing was learned, each less its margin. Out: `limit_raw` (H, W), rounded down.
     """
+    cad_base_m, cad_noise_per_m, reference_base_m, reference_gain, range_max_m, depth_scale_m = Margins(*margins)
     height, width = limit_raw.shape
     for y in range(height):
         for x in range(width):
@@ -120,28 +143,23 @@ def band_of_row(
 
 @kernel
 def robot_band_raw(
-    window: NDArray[np.int64],
-    nearest_w: NDArray[np.float32],
-    farthest_w: NDArray[np.float32],
+    buffer: Buffer,
     rectangles: NDArray[np.int32],
     links: NDArray[np.bool_],
     noise_per_m: float,
     depth_m: float,
     depth_scale_m: float,
-    near_raw: NDArray[np.uint16],
-    span_raw: NDArray[np.uint16],
-    columns: NDArray[np.int32],
+    band: Band,
 ) -> None:
     """The band of raw depths in which a measurement belongs to the robot, as `rasterize.draw_meshes` has drawn it.
 
     From the nearest padded surface less its noise margin, or from 0 where the camera stands in the padding, to the
     farthest one, or `depth_m` behind the nearest if that is farther, plus the margin there: what stands behind the
-    robot is still seen. The band
-    is stored as its lower end and its length, so that the filter needs one unsigned compare. Where there is no robot
-    it is empty: its lower end is where no limit reaches. `columns` (H, 2) holds of each row the first column and the
-    one after the last that the images `near_raw` and `span_raw` (H, W) have a band in; it is renewed, and what was
-    there before is made empty.
+    robot is still seen. `band` is renewed, and what was there before is made empty.
     """
+    buffer, band = Buffer(*buffer), Band(*band)
+    window, nearest_w, farthest_w = buffer
+    near_raw, span_raw, columns = band
     noise = np.float32(noise_per_m)
     depth = np.float32(depth_m)
     units = np.float32(1.0 / depth_scale_m)
@@ -167,8 +185,9 @@ def robot_band_raw(
 
 
 @kernel
-def clear_band(near_raw: NDArray[np.uint16], span_raw: NDArray[np.uint16], columns: NDArray[np.int32]) -> None:
-    """Make the band of `robot_band_raw` empty everywhere."""
+def clear_band(band: Band) -> None:
+    """Make the band of the robot empty everywhere."""
+    near_raw, span_raw, columns = Band(*band)
     for y in range(len(near_raw)):
         empty_row(near_raw[y], span_raw[y], columns[y, 0], columns[y, 1])
         columns[y, 0], columns[y, 1] = 0, 0
@@ -184,14 +203,12 @@ def lower_row(nearest_w: NDArray[np.float32], depth_m: NDArray[np.float32]) -> N
 
 @kernel
 def lower_depth(
-    window: NDArray[np.int64],
-    nearest_w: NDArray[np.float32],
-    rectangles: NDArray[np.int32],
-    links: NDArray[np.bool_],
-    depth_m: NDArray[np.float32],
+    buffer: Buffer, rectangles: NDArray[np.int32], links: NDArray[np.bool_], depth_m: NDArray[np.float32]
 ) -> None:
     """Lower `depth_m` (H, W) to what `rasterize.draw_meshes` has drawn where that is nearer."""
+    buffer = Buffer(*buffer)
+    window = buffer.window
     for y in range(window[0], window[0] + window[2]):
         first, end = span_of_row(y, rectangles, links, links)
         at = (y - window[0]) * window[3] - window[1]
-        lower_row(nearest_w[at + first : at + end], depth_m[y, first:end])
+        lower_row(buffer.nearest_w[at + first : at + end], depth_m[y, first:end])

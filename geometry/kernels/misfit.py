@@ -6,8 +6,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from geometry.kernels.agreement import Tolerance
 from geometry.kernels.jit import kernel
-from geometry.kernels.pinhole import deproject, moved, nearest_pixel, project, rows_of_32
+from geometry.kernels.pinhole import Camera, deproject, in_32, moved, nearest_pixel, project, rows_of_32
 
 UNKNOWN_MISFIT = 0.5
 """Of a pixel that falls where nothing is known: neither does it fit, nor does it not."""
@@ -18,11 +19,9 @@ def compared_points(
     depth_raw: NDArray[np.uint16],
     static_raw: NDArray[np.uint16],
     robot_near_raw: NDArray[np.uint16],
-    focal_px: tuple[float, float],
-    centre_px: tuple[float, float],
+    camera: Camera,
+    tolerance: Tolerance,
     stride_px: int,
-    tolerance_base_raw: float,
-    tolerance_per_raw2: float,
     points_raw: NDArray[np.float32],
     tallies: NDArray[np.int64],
 ) -> int:
@@ -30,11 +29,10 @@ def compared_points(
 
     `static_raw` (H, W) is the expected raw depth, 0 where nothing is known. Out: `points_raw` (3, N), of which as many
     columns as are returned; `tallies` (4,) = pixels looked at, of these before a known surface, measured, and farther
-    away than the surface there by more than `base + per_raw2 * expected**2`, which a correct picture cannot show.
+    away than the surface there by more than the tolerance, which a correct picture cannot show.
     """
+    camera, tolerance = Camera(*camera), Tolerance(*tolerance)
     tallies[:] = 0
-    fx, fy = focal_px
-    cx, cy = centre_px
     height, width = depth_raw.shape
     points = 0
     for y in range(stride_px // 2, height, stride_px):
@@ -49,9 +47,9 @@ def compared_points(
             if robot_near_raw[y, x] < 65535:
                 continue
             z = np.float64(raw)
-            if expected > 0.0 and z - expected > tolerance_base_raw + tolerance_per_raw2 * expected * expected:
+            if expected > 0.0 and z - expected > tolerance.base_raw + tolerance.per_raw2 * expected * expected:
                 tallies[3] += 1
-            points_raw[0, points], points_raw[1, points], points_raw[2, points] = deproject(x, y, z, fx, fy, cx, cy)
+            points_raw[0, points], points_raw[1, points], points_raw[2, points] = deproject(x, y, z, camera)
             points += 1
     return points
 
@@ -61,26 +59,20 @@ def misfit_there(
     points_raw: NDArray[np.float32],
     points: int,
     static_raw: NDArray[np.uint16],
-    focal_px: tuple[float, float],
-    centre_px: tuple[float, float],
+    camera: Camera,
     T_expected_there: NDArray[np.float64],
-    scale_base_raw: float,
-    scale_per_raw2: float,
+    scale: Tolerance,
 ) -> float:
     """How badly points fit the static surfaces if the camera stood elsewhere, summed.
 
     `T_expected_there` (4, 4), its translation in raw units, maps points of a camera that stands there into the frame
-    from which `static_raw` (H, W) was drawn. A residual `r` in scales of `base + per_raw2 * z**2` counts
-    `r**2 / (1 + r**2)`, so that what is unknown and near counts 1 wherever the camera stands.
+    from which `static_raw` (H, W) was drawn. A residual `r` in scales counts `r**2 / (1 + r**2)`, so that what is
+    unknown and near counts 1 wherever the camera stands.
     """
     rows = rows_of_32(T_expected_there)
-    fx, fy, cx, cy = (
-        np.float32(focal_px[0]),
-        np.float32(focal_px[1]),
-        np.float32(centre_px[0]),
-        np.float32(centre_px[1]),
-    )
-    base, per = np.float32(scale_base_raw), np.float32(scale_per_raw2)
+    lens = in_32(Camera(*camera))
+    scale = Tolerance(*scale)
+    base, per = np.float32(scale.base_raw), np.float32(scale.per_raw2)
     one = np.float32(1.0)
     height, width = static_raw.shape
     total = np.float64(0.0)
@@ -89,7 +81,7 @@ def misfit_there(
         there_x, there_y, there_z = moved(rows, points_raw[0, i], points_raw[1, i], z)
         misfit = np.float32(UNKNOWN_MISFIT)
         if there_z > 0.0:
-            u_px, v_px = project(there_x, there_y, one / there_z, fx, fy, cx, cy)
+            u_px, v_px = project(there_x, there_y, one / there_z, lens)
             u, v = nearest_pixel(u_px), nearest_pixel(v_px)
             if 0 <= u < width and 0 <= v < height:
                 expected = static_raw[np.uint64(v), np.uint64(u)]

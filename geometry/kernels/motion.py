@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,19 +14,33 @@ STILL, MOVED, KEPT_CHANGES = 0, 1, 2
 """What `settle` finds: no link moved; some did; and it is other links than before that stand still."""
 
 
+class Stillness(NamedTuple):
+    """A link stands still that moved by no more than `still_m`, and is kept when so for `kept_after` drawings."""
+
+    still_m: float
+    kept_after: int
+
+
+class Drawn(NamedTuple):
+    """Of L links the `poses` (L, 4, 4) and the padding at which they were drawn, and for how many drawings each has
+    been still; whether it is kept, and whether it is drawn now.
+    """
+
+    poses: NDArray[np.float64]
+    padding_m: NDArray[np.float32]
+    still_for: NDArray[np.int64]
+    is_kept: NDArray[np.bool_]
+    is_drawn: NDArray[np.bool_]
+
+
 @kernel
 def settle(
     poses: NDArray[np.float64],
     padding_m: NDArray[np.float32],
     reach_m: NDArray[np.float64],
-    still_m: float,
-    kept_after: int,
+    stillness: Stillness,
     anew: bool,
-    drawn_poses: NDArray[np.float64],
-    drawn_padding_m: NDArray[np.float32],
-    still_for: NDArray[np.int64],
-    is_kept: NDArray[np.bool_],
-    is_drawn: NDArray[np.bool_],
+    drawn: Drawn,
 ) -> int:
     """Compare the `poses` (L, 4, 4) and the padding (L,) of links with those at which they were drawn.
 
@@ -33,6 +49,8 @@ def settle(
     once a kept link moves, or another has been still for `kept_after`, those that are so long still are the kept ones.
     Out: `is_kept`, and `is_drawn` for the others (L,); pose and padding of what will be drawn now.
     """
+    still_m, kept_after = Stillness(*stillness)
+    drawn_poses, drawn_padding_m, still_for, is_kept, is_drawn = Drawn(*drawn)
     still_before = True
     for m in range(len(poses)):
         moved_m = abs(np.float64(padding_m[m]) - np.float64(drawn_padding_m[m]))

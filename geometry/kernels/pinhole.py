@@ -12,7 +12,7 @@ vectorised.
 
 from __future__ import annotations
 
-from typing import TypeAlias, TypeVar
+from typing import NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,45 @@ from numpy.typing import NDArray
 from geometry.kernels.jit import kernel
 
 Real = TypeVar("Real", float, np.float32)
+Real_co = TypeVar("Real_co", float, np.float32, covariant=True)
 
 Rows: TypeAlias = tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real, Real, Real, Real]
 """The first three rows of a rigid transform, one after the other: as scalars they stay in registers."""
+
+
+class Lens(Protocol[Real_co]):
+    """What projects: focal lengths and centre in pixels, in the type of the points."""
+
+    @property
+    def fx(self) -> Real_co: ...
+    @property
+    def fy(self) -> Real_co: ...
+    @property
+    def cx(self) -> Real_co: ...
+    @property
+    def cy(self) -> Real_co: ...
+
+
+class Camera(NamedTuple):
+    """A pinhole camera; all in pixels."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+
+class Camera32(NamedTuple):
+    """The same in float32."""
+
+    fx: np.float32
+    fy: np.float32
+    cx: np.float32
+    cy: np.float32
+    width: int
+    height: int
 
 
 @kernel
@@ -59,15 +95,22 @@ def moved(rows_a_b: Rows[Real], x: Real, y: Real, z: Real) -> tuple[Real, Real, 
 
 
 @kernel
-def project(x: Real, y: Real, w: Real, fx: Real, fy: Real, cx: Real, cy: Real) -> tuple[Real, Real]:
-    """Pixel coordinates u and v of a point of the camera frame whose inverse depth is `w`."""
-    return x * w * fx + cx, y * w * fy + cy
+def in_32(camera: Camera) -> Camera32:
+    """A camera for points in float32."""
+    c = camera
+    return Camera32(np.float32(c.fx), np.float32(c.fy), np.float32(c.cx), np.float32(c.cy), c.width, c.height)
 
 
 @kernel
-def deproject(u: float, v: float, z: float, fx: float, fy: float, cx: float, cy: float) -> tuple[float, float, float]:
+def project(x: Real, y: Real, w: Real, lens: Lens[Real]) -> tuple[Real, Real]:
+    """Pixel coordinates u and v of a point of the camera frame whose inverse depth is `w`."""
+    return x * w * lens.fx + lens.cx, y * w * lens.fy + lens.cy
+
+
+@kernel
+def deproject(u: float, v: float, z: float, camera: Camera) -> tuple[float, float, float]:
     """The point of the camera frame at depth `z` that pixel coordinates u and v show."""
-    return (u - cx) / fx * z, (v - cy) / fy * z, z
+    return (u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z
 
 
 @kernel

@@ -2,12 +2,13 @@
 """Where meshes come to lie on the screen.
 
 Conventions are those of `pinhole`. Corners are rounded to `1 / SUBPIXELS` of a pixel, so that what is drawn of them can
-be reckoned without rounding. `camera` (5,) is fx, fy, cx, cy in pixels and the near plane in metres.
+be reckoned without rounding.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,72 @@ SUBPIXELS = np.float32(512.0)
 SUBPIXEL = np.float32(1.0 / 512.0)
 
 
+class Screen(NamedTuple):
+    """The camera that is drawn for, in float32: `fx`, `fy`, `cx`, `cy`, `width` and `height` in pixels."""
+
+    fx: np.float32
+    fy: np.float32
+    cx: np.float32
+    cy: np.float32
+    near_m: np.float32
+    width: int
+    height: int
+
+
+class Meshes(NamedTuple):
+    """M meshes one after the other.
+
+    Mesh m has the vertices `vertex_starts[m]:vertex_starts[m + 1]` (M + 1,) of `vertices_m` (3, V) and likewise faces
+    of `faces` (3, F), whose indices count from the mesh's own first vertex. A vertex is placed at
+    `vertex + padding_m * offset`, with `offsets` (3, V). Of a `closed` (M,) one no back is ever seen.
+    """
+
+    vertices_m: NDArray[np.float32]
+    offsets: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    vertex_starts: NDArray[np.int32]
+    face_starts: NDArray[np.int32]
+    closed: NDArray[np.bool_]
+
+
+class Scratch(NamedTuple):
+    """Memory to draw meshes with.
+
+    `placed` (6, V): pixel coordinates, inverse depth, and, of a mesh that the near plane cuts, coordinates in the
+    camera frame. `before` (M,): how many of a mesh's vertices lie before the near plane. `kinds` (most faces of a
+    mesh,) and `lists` (3, most faces + 1) of its triangles. `corners` (3, 3) and `polygon` (4, 3) of one that is cut.
+    """
+
+    placed: NDArray[np.float32]
+    before: NDArray[np.int32]
+    kinds: NDArray[np.uint8]
+    lists: NDArray[np.int32]
+    corners: NDArray[np.float32]
+    polygon: NDArray[np.float64]
+
+
+class Vertices(NamedTuple):
+    """Places or offsets of a mesh's vertices, each coordinate by itself."""
+
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    z: NDArray[np.float32]
+
+
+class Mesh(NamedTuple):
+    """One mesh as it was placed: its triangles by their corners' numbers, and its vertices, see `Scratch.placed`."""
+
+    a: NDArray[np.int32]
+    b: NDArray[np.int32]
+    c: NDArray[np.int32]
+    u_px: NDArray[np.float32]
+    v_px: NDArray[np.float32]
+    w_per_m: NDArray[np.float32]
+    x_m: NDArray[np.float32]
+    y_m: NDArray[np.float32]
+    z_m: NDArray[np.float32]
+
+
 @kernel
 def rounded(u_or_v: np.float32) -> np.float32:
     """A pixel coordinate in whole subpixels."""
@@ -28,26 +95,37 @@ def rounded(u_or_v: np.float32) -> np.float32:
 
 
 @kernel
+def mesh_of(m: int, meshes: Meshes, scratch: Scratch) -> Mesh:
+    """Mesh m, and where it is placed."""
+    a, b, c = meshes.faces[0], meshes.faces[1], meshes.faces[2]
+    start, stop = meshes.face_starts[m], meshes.face_starts[m + 1]
+    first, end = meshes.vertex_starts[m], meshes.vertex_starts[m + 1]
+    placed = scratch.placed
+    return Mesh(
+        a[start:stop], b[start:stop], c[start:stop],
+        placed[0, first:end], placed[1, first:end], placed[2, first:end],
+        placed[3, first:end], placed[4, first:end], placed[5, first:end],
+    )  # fmt: skip
+
+
+@kernel
 def place_vertices(
-    x_m: NDArray[np.float32],
-    y_m: NDArray[np.float32],
-    z_m: NDArray[np.float32],
-    offset_x: NDArray[np.float32],
-    offset_y: NDArray[np.float32],
-    offset_z: NDArray[np.float32],
+    vertices_m: Vertices,
+    offsets: Vertices,
     padding_m: np.float32,
     T_camera_mesh: NDArray[np.float64],
-    camera: NDArray[np.float32],
-    u_px: NDArray[np.float32],
-    v_px: NDArray[np.float32],
-    w_per_m: NDArray[np.float32],
+    screen: Screen,
+    mesh: Mesh,
 ) -> int:
-    """Vertices to the screen; returns how many lie before the near plane.
+    """Vertices to the screen, into `mesh`; returns how many lie before the near plane.
 
     Written for the vectoriser: one type, no branch, each coordinate in its own array.
     """
     rows = rows_of_32(T_camera_mesh)
-    fx, fy, cx, cy, near_m = camera[0], camera[1], camera[2], camera[3], camera[4]
+    x_m, y_m, z_m = vertices_m
+    offset_x, offset_y, offset_z = offsets
+    u_px, v_px, w_per_m = mesh.u_px, mesh.v_px, mesh.w_per_m
+    near_m = screen.near_m
     one = np.float32(1.0)
     before = 0
     for i in range(len(x_m)):
@@ -56,7 +134,7 @@ def place_vertices(
         pz = z_m[i] + padding_m * offset_z[i]
         x, y, z = moved(rows, px, py, pz)
         w = one / max(z, near_m)
-        u, v = project(x, y, w, fx, fy, cx, cy)
+        u, v = project(x, y, w, screen)
         u_px[i], v_px[i], w_per_m[i] = rounded(u), rounded(v), w
         before += z < near_m
     return before
@@ -64,20 +142,13 @@ def place_vertices(
 
 @kernel
 def bring_vertices(
-    x_m: NDArray[np.float32],
-    y_m: NDArray[np.float32],
-    z_m: NDArray[np.float32],
-    offset_x: NDArray[np.float32],
-    offset_y: NDArray[np.float32],
-    offset_z: NDArray[np.float32],
-    padding_m: np.float32,
-    T_camera_mesh: NDArray[np.float64],
-    camera_x_m: NDArray[np.float32],
-    camera_y_m: NDArray[np.float32],
-    camera_z_m: NDArray[np.float32],
+    vertices_m: Vertices, offsets: Vertices, padding_m: np.float32, T_camera_mesh: NDArray[np.float64], mesh: Mesh
 ) -> None:
     """Vertices to the camera frame, reckoned as `place_vertices` does: only a mesh that is cut needs them there."""
     rows = rows_of_32(T_camera_mesh)
+    x_m, y_m, z_m = vertices_m
+    offset_x, offset_y, offset_z = offsets
+    camera_x_m, camera_y_m, camera_z_m = mesh.x_m, mesh.y_m, mesh.z_m
     for i in range(len(x_m)):
         px = x_m[i] + padding_m * offset_x[i]
         py = y_m[i] + padding_m * offset_y[i]
@@ -86,10 +157,9 @@ def bring_vertices(
 
 
 @kernel
-def bound(
-    u_px: NDArray[np.float32], v_px: NDArray[np.float32], width: int, height: int, rectangle: NDArray[np.int32]
-) -> None:
-    """Set `rectangle` (4,) to the pixels within the bounds of some points; in integers, which the vectoriser can."""
+def bound(mesh: Mesh, screen: Screen, rectangle: NDArray[np.int32]) -> None:
+    """Set `rectangle` (4,) to the pixels within a mesh's bounds; in integers, which the vectoriser can."""
+    u_px, v_px, width, height = mesh.u_px, mesh.v_px, screen.width, screen.height
     left, top = np.int32(width), np.int32(height)
     right, bottom = np.int32(-1), np.int32(-1)
     for i in range(len(u_px)):
@@ -105,12 +175,12 @@ def bound(
 
 
 @kernel
-def clip(corners: NDArray[np.float32], camera: NDArray[np.float32], polygon: NDArray[np.float64]) -> int:
-    """Cut a triangle with corners (3, 3) in the camera frame at the near plane; returns how many corners are left.
+def clip(screen: Screen, scratch: Scratch) -> int:
+    """Cut the triangle whose corners `scratch` has at the near plane; returns how many corners are left.
 
-    Out: `polygon` (4, 3), their pixel coordinates and inverse depth; a triangle cut by a plane has up to four.
+    Out: its `polygon`, their pixel coordinates and inverse depth; a triangle cut by a plane has up to four.
     """
-    fx, fy, cx, cy, near_m = camera[0], camera[1], camera[2], camera[3], camera[4]
+    corners, polygon, near_m = scratch.corners, scratch.polygon, screen.near_m
     count = 0
     for i in range(3):
         j = (i + 1) % 3
@@ -119,7 +189,7 @@ def clip(corners: NDArray[np.float32], camera: NDArray[np.float32], polygon: NDA
         if z_i >= near_m:
             # Reckoned as `place_vertices` does: a neighbour that is not cut has the same corners.
             w = np.float32(1.0) / z_i
-            u, v = project(corners[i, 0], corners[i, 1], w, fx, fy, cx, cy)
+            u, v = project(corners[i, 0], corners[i, 1], w, screen)
             polygon[count, 0], polygon[count, 1], polygon[count, 2] = rounded(u), rounded(v), w
             count += 1
         if (z_i >= near_m) != (z_j >= near_m):
@@ -129,48 +199,29 @@ def clip(corners: NDArray[np.float32], camera: NDArray[np.float32], polygon: NDA
             x = corners[front, 0] + share * (corners[back, 0] - corners[front, 0])
             y = corners[front, 1] + share * (corners[back, 1] - corners[front, 1])
             w = np.float32(1.0) / near_m
-            polygon[count, 0], polygon[count, 1] = project(x, y, w, fx, fy, cx, cy)
+            polygon[count, 0], polygon[count, 1] = project(x, y, w, screen)
             polygon[count, 2] = w
             count += 1
     return count
 
 
 @kernel
-def corners_of(
-    i: int,
-    j: int,
-    k: int,
-    x_m: NDArray[np.float32],
-    y_m: NDArray[np.float32],
-    z_m: NDArray[np.float32],
-    corners: NDArray[np.float32],
-) -> None:
-    """The corners (3, 3) of a triangle."""
-    corners[0, 0], corners[0, 1], corners[0, 2] = x_m[i], y_m[i], z_m[i]
-    corners[1, 0], corners[1, 1], corners[1, 2] = x_m[j], y_m[j], z_m[j]
-    corners[2, 0], corners[2, 1], corners[2, 2] = x_m[k], y_m[k], z_m[k]
+def take_corners(mesh: Mesh, f: int, corners: NDArray[np.float32]) -> None:
+    """The corners (3, 3) of triangle f in the camera frame."""
+    i, j, k = mesh.a[f], mesh.b[f], mesh.c[f]
+    corners[0, 0], corners[0, 1], corners[0, 2] = mesh.x_m[i], mesh.y_m[i], mesh.z_m[i]
+    corners[1, 0], corners[1, 1], corners[1, 2] = mesh.x_m[j], mesh.y_m[j], mesh.z_m[j]
+    corners[2, 0], corners[2, 1], corners[2, 2] = mesh.x_m[k], mesh.y_m[k], mesh.z_m[k]
 
 
 @kernel
-def bound_cut(
-    a: NDArray[np.int32],
-    b: NDArray[np.int32],
-    c: NDArray[np.int32],
-    x_m: NDArray[np.float32],
-    y_m: NDArray[np.float32],
-    z_m: NDArray[np.float32],
-    camera: NDArray[np.float32],
-    width: int,
-    height: int,
-    corners: NDArray[np.float32],
-    polygon: NDArray[np.float64],
-    rectangle: NDArray[np.int32],
-) -> None:
+def bound_cut(mesh: Mesh, screen: Screen, scratch: Scratch, rectangle: NDArray[np.int32]) -> None:
     """`bound` for a mesh that the near plane cuts: of what is left of its triangles."""
+    width, height, polygon = screen.width, screen.height, scratch.polygon
     left, top, right, bottom = 1e9, 1e9, -1.0, -1.0
-    for f in range(len(a)):
-        corners_of(a[f], b[f], c[f], x_m, y_m, z_m, corners)
-        for n in range(clip(corners, camera, polygon)):
+    for f in range(len(mesh.a)):
+        take_corners(mesh, f, scratch.corners)
+        for n in range(clip(screen, scratch)):
             left, right = min(left, polygon[n, 0]), max(right, polygon[n, 0])
             top, bottom = min(top, polygon[n, 1]), max(bottom, polygon[n, 1])
     rectangle[0], rectangle[1] = math.ceil(max(top, 0.0)), math.floor(min(bottom, height - 1.0))
@@ -181,57 +232,33 @@ def bound_cut(
 
 @kernel
 def place_meshes(
-    vertices_m: NDArray[np.float32],
-    offsets: NDArray[np.float32],
-    faces: NDArray[np.int32],
-    vertex_starts: NDArray[np.int32],
-    face_starts: NDArray[np.int32],
+    meshes: Meshes,
     chosen: NDArray[np.bool_],
     T_camera_mesh: NDArray[np.float64],
     padding_m: NDArray[np.float32],
-    camera: NDArray[np.float32],
-    width: int,
-    height: int,
-    placed: NDArray[np.float32],
-    before: NDArray[np.int32],
-    corners: NDArray[np.float32],
-    polygon: NDArray[np.float64],
+    screen: Screen,
+    scratch: Scratch,
     rectangles: NDArray[np.int32],
 ) -> None:
-    """Bring the `chosen` (M,) of M meshes to the screen, each with its pose and padding.
+    """Bring the `chosen` (M,) of M meshes to the screen, each with its pose (M, 4, 4) and padding (M,).
 
-    They lie one after the other in `vertices_m` (3, V) and `faces` (3, F): mesh m has the vertices
-    `vertex_starts[m]:vertex_starts[m + 1]` and likewise faces, whose indices count from the mesh's own first vertex.
-    A vertex is placed at `vertex + padding_m[m] * offset`, with `offsets` (3, V). `T_camera_mesh` (M, 4, 4).
-
-    Out: `placed` (6, V), pixel coordinates, inverse depth, and, of a mesh that the near plane cuts, coordinates in the
-    camera frame; `before` (M,), how many of the vertices lie before the near plane; `rectangles` (M, 4), the pixels
-    that a mesh may touch: first and last row, first and last column, empty (first > last) where it is not in view.
-    Scratch: `corners` (3, 3), `polygon` (4, 3).
+    Out: what `scratch` has of where they are placed; `rectangles` (M, 4), the pixels that a mesh may touch: first and
+    last row, first and last column, empty (first > last) where it is not in view.
     """
+    x_m, y_m, z_m = meshes.vertices_m[0], meshes.vertices_m[1], meshes.vertices_m[2]
+    offset_x, offset_y, offset_z = meshes.offsets[0], meshes.offsets[1], meshes.offsets[2]
     for m in range(len(chosen)):
         if not chosen[m]:
             continue
-        first, end = vertex_starts[m], vertex_starts[m + 1]
-        x_m, y_m, z_m = vertices_m[0, first:end], vertices_m[1, first:end], vertices_m[2, first:end]
+        first, end = meshes.vertex_starts[m], meshes.vertex_starts[m + 1]
+        vertices_m = Vertices(x_m[first:end], y_m[first:end], z_m[first:end])
+        offsets = Vertices(offset_x[first:end], offset_y[first:end], offset_z[first:end])
         # Where nothing is added, nothing need be fetched from memory: any numbers that are there will do.
         added = offsets if padding_m[m] != 0.0 else vertices_m
-        offset_x, offset_y, offset_z = added[0, first:end], added[1, first:end], added[2, first:end]
-        u_px, v_px, w_per_m = placed[0, first:end], placed[1, first:end], placed[2, first:end]
-        before[m] = place_vertices(
-            x_m, y_m, z_m, offset_x, offset_y, offset_z, padding_m[m], T_camera_mesh[m], camera, u_px, v_px, w_per_m
-        )  # fmt: skip
-        if before[m] == 0:
-            bound(u_px, v_px, width, height, rectangles[m])
+        mesh = mesh_of(m, meshes, scratch)
+        scratch.before[m] = place_vertices(vertices_m, added, padding_m[m], T_camera_mesh[m], screen, mesh)
+        if scratch.before[m] == 0:
+            bound(mesh, screen, rectangles[m])
         else:
-            camera_x_m, camera_y_m, camera_z_m = placed[3, first:end], placed[4, first:end], placed[5, first:end]
-            bring_vertices(
-                x_m, y_m, z_m, offset_x, offset_y, offset_z, padding_m[m], T_camera_mesh[m],
-                camera_x_m, camera_y_m, camera_z_m,
-            )  # fmt: skip
-            a, b, c = faces[0], faces[1], faces[2]
-            start, stop = face_starts[m], face_starts[m + 1]
-            bound_cut(
-                a[start:stop], b[start:stop], c[start:stop], camera_x_m, camera_y_m, camera_z_m,
-                camera, width, height, corners, polygon, rectangles[m],
-            )  # fmt: skip
+            bring_vertices(vertices_m, added, padding_m[m], T_camera_mesh[m], mesh)
+            bound_cut(mesh, screen, scratch, rectangles[m])

@@ -7,8 +7,7 @@ A closed mesh shows its nearest surface by the faces that are turned here, and i
 of its triangles is drawn into one buffer only.
 
 A buffer holds only a *window* of the picture, the rectangle about all that is drawn: thirty times a second it comes
-from cold memory, where few pages in a row are fetched several times as fast as many scattered ones. Window (4,):
-first row, first column, rows, and columns with those that `LANES` may run over; a buffer is flat.
+from cold memory, where few pages in a row are fetched several times as fast as many scattered ones.
 
 Small triangles, which are nearly all, are drawn by edge functions in integers, which never round, `LANES` pixels of a
 row at once. Large ones go span by span in float64.
@@ -17,13 +16,14 @@ row at once. Large ones go span by span in float64.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geometry.kernels.int32 import add, multiply, none_negative
 from geometry.kernels.jit import kernel
-from geometry.kernels.project import SUBPIXELS, clip, corners_of, place_meshes
+from geometry.kernels.project import SUBPIXELS, Mesh, Meshes, Scratch, Screen, clip, mesh_of, place_meshes, take_corners
 
 NOTHING_NEAREST = np.float32(0.0)
 """`nearest_w` of a pixel without a surface: infinitely far."""
@@ -48,22 +48,47 @@ AWAY = 4
 """Added to it when the triangle is turned away."""
 
 
+class Buffer(NamedTuple):
+    """What is drawn into, 1/m.
+
+    `window` (4,): first row, first column, rows, and columns with those that `LANES` may run over. `nearest_w` and
+    `farthest_w` are flat, with room for H * (W + LANES) + LANES pixels. `farthest_w` may be empty: then none is drawn.
+    """
+
+    window: NDArray[np.int64]
+    nearest_w: NDArray[np.float32]
+    farthest_w: NDArray[np.float32]
+
+
+class Side(NamedTuple):
+    """The nearest or the farthest surface: which triangles show it, turned here or away, and where it is kept.
+
+    The largest of `sign * w` counts; `sign` is 1 for the nearest.
+    """
+
+    with_here: bool
+    with_away: bool
+    sign: np.float32
+    window: NDArray[np.int64]
+    buffer_w: NDArray[np.float32]
+
+
+class Corner(NamedTuple):
+    """Of a triangle: its pixel coordinates and w."""
+
+    u: float
+    v: float
+    w: float
+
+
 @kernel
-def sort_faces(
-    a: NDArray[np.int32],
-    b: NDArray[np.int32],
-    c: NDArray[np.int32],
-    u_px: NDArray[np.float32],
-    v_px: NDArray[np.float32],
-    with_away: bool,
-    last_column: np.float32,
-    last_row: np.float32,
-    kinds: NDArray[np.uint8],
-) -> None:
+def sort_faces(mesh: Mesh, with_away: bool, screen: Screen, kinds: NDArray[np.uint8]) -> None:
     """What is to be done with each triangle, all of whose corners lie beyond the near plane.
 
     Written for the vectoriser: no branch. Faces turned away are left out unless they are wanted (Algorithm 3).
     """
+    a, b, c, u_px, v_px = mesh.a, mesh.b, mesh.c, mesh.u_px, mesh.v_px
+    last_column, last_row = np.float32(screen.width - 1), np.float32(screen.height - 1)
     zero, width, height = np.float32(0.0), np.float32(2 * LANES - 1), np.float32(SMALL_ROWS - 1)
     for f in range(len(a)):
         i, j, k = np.uint32(a[f]), np.uint32(b[f]), np.uint32(c[f])
@@ -82,23 +107,17 @@ def sort_faces(
 
 
 @kernel
-def sort_cut_faces(
-    a: NDArray[np.int32],
-    b: NDArray[np.int32],
-    c: NDArray[np.int32],
-    camera_z_m: NDArray[np.float32],
-    near_m: np.float32,
-    kinds: NDArray[np.uint8],
-) -> None:
+def sort_cut_faces(mesh: Mesh, near_m: np.float32, kinds: NDArray[np.uint8]) -> None:
     """Mend `kinds` where a corner lies before the near plane: such a triangle is cut, or not seen at all.
 
     Where it is turned is told when it is cut.
     """
-    for f in range(len(a)):
+    z_m = mesh.z_m
+    for f in range(len(mesh.a)):
         beyond = 0
-        beyond += camera_z_m[a[f]] >= near_m
-        beyond += camera_z_m[b[f]] >= near_m
-        beyond += camera_z_m[c[f]] >= near_m
+        beyond += z_m[mesh.a[f]] >= near_m
+        beyond += z_m[mesh.b[f]] >= near_m
+        beyond += z_m[mesh.c[f]] >= near_m
         if beyond < 3:
             kinds[f] = LARGE if beyond > 0 else UNSEEN
 
@@ -124,29 +143,19 @@ def list_faces(
 
 
 @kernel
-def fill_small(
-    faces: NDArray[np.int32],
-    sign: np.float32,
-    a: NDArray[np.int32],
-    b: NDArray[np.int32],
-    c: NDArray[np.int32],
-    u_px: NDArray[np.float32],
-    v_px: NDArray[np.float32],
-    w_per_m: NDArray[np.float32],
-    width: int,
-    height: int,
-    window: NDArray[np.int64],
-    buffer_w: NDArray[np.float32],
-) -> None:
-    """Draw the small triangles whose numbers are `faces`: the largest of `sign * w`, which is 1 for the nearest.
+def fill_small(faces: NDArray[np.int32], mesh: Mesh, screen: Screen, side: Side) -> None:
+    """Draw the small triangles whose numbers are `faces`.
 
     A pixel is drawn when its centre is on the inner side of all three edges, or on one: neighbours leave no gap, for
     integers do not round.
     """
+    a, b, c = mesh.a, mesh.b, mesh.c
+    u_px, v_px, w_per_m = mesh.u_px, mesh.v_px, mesh.w_per_m
+    sign, buffer_w = side.sign, side.buffer_w
     zero = np.float32(0.0)
-    last_column, last_row = np.float32(width - 1), np.float32(height - 1)
+    last_column, last_row = np.float32(screen.width - 1), np.float32(screen.height - 1)
     pixel = np.int32(SUBPIXELS)
-    first_row, first_column, stride = window[0], window[1], window[3]
+    first_row, first_column, stride = side.window[0], side.window[1], side.window[3]
     for n in range(len(faces)):
         f = np.uint32(faces[n])
         i, j, k = np.uint32(a[f]), np.uint32(b[f]), np.uint32(c[f])
@@ -204,30 +213,19 @@ def fill_small(
 
 
 @kernel
-def fill_triangle(
-    u0: float,
-    v0: float,
-    w0: float,
-    u1: float,
-    v1: float,
-    w1: float,
-    u2: float,
-    v2: float,
-    w2: float,
-    width: int,
-    height: int,
-    window: NDArray[np.int64],
-    buffer_w: NDArray[np.float32],
-) -> None:
-    """Draw one triangle of any size, given by pixel coordinates and w of its corners: the largest w.
+def fill_triangle(one: Corner, two: Corner, three: Corner, screen: Screen, side: Side) -> None:
+    """Draw one triangle of any size: the largest w.
 
     Every pixel centre on or inside an edge is drawn, and the crossing of an edge with a row is reckoned from its
     upper end whichever triangle it belongs to: neighbours leave no gap.
     """
+    u0, v0, w0 = one
+    u1, v1, w1 = two
+    u2, v2, w2 = three
     left = max(math.ceil(min(u0, u1, u2)), 0)
-    right = min(math.floor(max(u0, u1, u2)), width - 1)
+    right = min(math.floor(max(u0, u1, u2)), screen.width - 1)
     top = max(math.ceil(min(v0, v1, v2)), 0)
-    bottom = min(math.floor(max(v0, v1, v2)), height - 1)
+    bottom = min(math.floor(max(v0, v1, v2)), screen.height - 1)
     if left > right or top > bottom:
         return
     if v1 < v0:
@@ -258,134 +256,77 @@ def fill_triangle(
         w = min(max(np.float32(w_row + (first - u0) * w_per_u), w_low), w_high)
         w_last = min(max(np.float32(w_row + (last - u0) * w_per_u), w_low), w_high)
         step = (w_last - w) / np.float32(max(last - first, 1))
-        at = (y - window[0]) * window[3] + first - window[1]
-        buffer_row = buffer_w[at : at + last + 1 - first]
+        at = (y - side.window[0]) * side.window[3] + first - side.window[1]
+        buffer_row = side.buffer_w[at : at + last + 1 - first]
         for x in range(len(buffer_row)):
             here = w + np.float32(x) * step
             buffer_row[x] = here if here > buffer_row[x] else buffer_row[x]
 
 
 @kernel
-def fill_clipped(
-    corners: NDArray[np.float32],
-    polygon: NDArray[np.float64],
-    with_here: bool,
-    with_away: bool,
-    sign: np.float32,
-    camera: NDArray[np.float32],
-    width: int,
-    height: int,
-    window: NDArray[np.int64],
-    buffer_w: NDArray[np.float32],
-) -> None:
-    """Draw what lies beyond the near plane of a triangle with corners (3, 3) in the camera frame; `polygon` (4, 3)."""
-    for i in range(1, clip(corners, camera, polygon) - 1):
+def fill_clipped(screen: Screen, side: Side, scratch: Scratch) -> None:
+    """Draw what lies beyond the near plane of the triangle whose corners `scratch` has."""
+    sign, polygon = side.sign, scratch.polygon
+    for i in range(1, clip(screen, scratch) - 1):
         u0, v0 = polygon[0, 0], polygon[0, 1]
         u1, v1 = polygon[i, 0], polygon[i, 1]
         u2, v2 = polygon[i + 1, 0], polygon[i + 1, 1]
         double_area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
-        if (with_here and double_area < 0.0) or (with_away and double_area > 0.0):
-            fill_triangle(
-                u0, v0, sign * polygon[0, 2],
-                u1, v1, sign * polygon[i, 2],
-                u2, v2, sign * polygon[i + 1, 2],
-                width, height, window, buffer_w,
-            )  # fmt: skip
+        if (side.with_here and double_area < 0.0) or (side.with_away and double_area > 0.0):
+            one, two = Corner(u0, v0, sign * polygon[0, 2]), Corner(u1, v1, sign * polygon[i, 2])
+            fill_triangle(one, two, Corner(u2, v2, sign * polygon[i + 1, 2]), screen, side)
+
+
+@kernel
+def corner_of(mesh: Mesh, i: int, sign: np.float32) -> Corner:
+    """Vertex i, in float64 as after clipping, so that neighbours agree on where their edge crosses a row."""
+    return Corner(np.float64(mesh.u_px[i]), np.float64(mesh.v_px[i]), np.float64(sign * mesh.w_per_m[i]))
 
 
 @kernel
 def fill_large(
-    faces: NDArray[np.int32],
-    kinds: NDArray[np.uint8],
-    with_here: bool,
-    with_away: bool,
-    sign: np.float32,
-    a: NDArray[np.int32],
-    b: NDArray[np.int32],
-    c: NDArray[np.int32],
-    before: int,
-    u_px: NDArray[np.float32],
-    v_px: NDArray[np.float32],
-    w_per_m: NDArray[np.float32],
-    x_m: NDArray[np.float32],
-    y_m: NDArray[np.float32],
-    z_m: NDArray[np.float32],
-    camera: NDArray[np.float32],
-    width: int,
-    height: int,
-    window: NDArray[np.int64],
-    corners: NDArray[np.float32],
-    polygon: NDArray[np.float64],
-    buffer_w: NDArray[np.float32],
+    faces: NDArray[np.int32], mesh: Mesh, is_cut: bool, screen: Screen, side: Side, scratch: Scratch
 ) -> None:
-    """Draw those of the large triangles whose numbers are `faces` that are turned as wanted, `sign` as in `fill_small`.
+    """Draw those of the large triangles whose numbers are `faces` that are turned as wanted.
 
-    They belong to a mesh `before` of whose vertices lie before the near plane.
+    `is_cut` when vertices of their mesh lie before the near plane.
     """
-    near_m = camera[4]
+    near_m, z_m, sign = screen.near_m, mesh.z_m, side.sign
     for n in range(len(faces)):
         f = faces[n]
-        i, j, k = a[f], b[f], c[f]
-        if before > 0 and (z_m[i] < near_m or z_m[j] < near_m or z_m[k] < near_m):
-            corners_of(i, j, k, x_m, y_m, z_m, corners)
-            fill_clipped(
-                corners, polygon, with_here, with_away, sign, camera, width, height, window, buffer_w
-            )  # fmt: skip
-        elif with_away if kinds[f] >= AWAY else with_here:
-            # In float64 as after clipping, so that neighbours agree on where their edge crosses a row.
-            fill_triangle(
-                np.float64(u_px[i]), np.float64(v_px[i]), np.float64(sign * w_per_m[i]),
-                np.float64(u_px[j]), np.float64(v_px[j]), np.float64(sign * w_per_m[j]),
-                np.float64(u_px[k]), np.float64(v_px[k]), np.float64(sign * w_per_m[k]),
-                width, height, window, buffer_w,
-            )  # fmt: skip
+        i, j, k = mesh.a[f], mesh.b[f], mesh.c[f]
+        if is_cut and (z_m[i] < near_m or z_m[j] < near_m or z_m[k] < near_m):
+            take_corners(mesh, f, scratch.corners)
+            fill_clipped(screen, side, scratch)
+        elif side.with_away if scratch.kinds[f] >= AWAY else side.with_here:
+            one, two, three = corner_of(mesh, i, sign), corner_of(mesh, j, sign), corner_of(mesh, k, sign)
+            fill_triangle(one, two, three, screen, side)
 
 
 @kernel
-def fill_mesh(
-    a: NDArray[np.int32],
-    b: NDArray[np.int32],
-    c: NDArray[np.int32],
-    closed: bool,
-    before: int,
-    u_px: NDArray[np.float32],
-    v_px: NDArray[np.float32],
-    w_per_m: NDArray[np.float32],
-    x_m: NDArray[np.float32],
-    y_m: NDArray[np.float32],
-    z_m: NDArray[np.float32],
-    camera: NDArray[np.float32],
-    width: int,
-    height: int,
-    window: NDArray[np.int64],
-    kinds: NDArray[np.uint8],
-    lists: NDArray[np.int32],
-    corners: NDArray[np.float32],
-    polygon: NDArray[np.float64],
-    nearest_w: NDArray[np.float32],
-    farthest_w: NDArray[np.float32],
-) -> None:
-    """Draw one of the meshes of `draw_meshes`, `before` of whose vertices lie before the near plane."""
-    with_away = not closed or len(farthest_w) > 0
-    sort_faces(a, b, c, u_px, v_px, with_away, np.float32(width - 1), np.float32(height - 1), kinds)
-    if before > 0:
-        sort_cut_faces(a, b, c, z_m, camera[4], kinds)
+def fill_mesh(mesh: Mesh, closed: bool, is_cut: bool, screen: Screen, buffer: Buffer, scratch: Scratch) -> None:
+    """Draw one of the meshes of `draw_meshes`; `is_cut` when vertices of it lie before the near plane."""
+    with_farthest = len(buffer.farthest_w) > 0
+    kinds, lists = scratch.kinds[: len(mesh.a)], scratch.lists
+    sort_faces(mesh, not closed or with_farthest, screen, kinds)
+    if is_cut:
+        sort_cut_faces(mesh, screen.near_m, kinds)
     heres, aways, larges = list_faces(kinds, lists[0], lists[1], lists[2])
     here, away, large = lists[0, :heres], lists[1, :aways], lists[2, :larges]
-    for side in range(2):
-        buffer_w = nearest_w if side == 0 else farthest_w
-        if len(buffer_w) == 0:
-            continue
-        sign = np.float32(1.0) if side == 0 else np.float32(-1.0)
-        with_here, with_away = not closed or side == 0, not closed or side == 1
-        if with_here:
-            fill_small(here, sign, a, b, c, u_px, v_px, w_per_m, width, height, window, buffer_w)
-        if with_away:
-            fill_small(away, sign, a, b, c, u_px, v_px, w_per_m, width, height, window, buffer_w)
-        fill_large(
-            large, kinds, with_here, with_away, sign, a, b, c, before, u_px, v_px, w_per_m, x_m, y_m, z_m,
-            camera, width, height, window, corners, polygon, buffer_w,
-        )  # fmt: skip
+    for n in range(1 + with_farthest):
+        is_farthest = n == 1
+        side = Side(
+            not closed or not is_farthest,
+            not closed or is_farthest,
+            np.float32(-1.0) if is_farthest else np.float32(1.0),
+            buffer.window,
+            buffer.farthest_w if is_farthest else buffer.nearest_w,
+        )
+        if side.with_here:
+            fill_small(here, mesh, screen, side)
+        if side.with_away:
+            fill_small(away, mesh, screen, side)
+        fill_large(large, mesh, is_cut, screen, side, scratch)
 
 
 @kernel
@@ -406,14 +347,10 @@ def span_of_row(
 
 @kernel
 def open_window(
-    rectangles: NDArray[np.int32],
-    chosen: NDArray[np.bool_],
-    others: NDArray[np.bool_],
-    window: NDArray[np.int64],
-    nearest_w: NDArray[np.float32],
-    farthest_w: NDArray[np.float32],
+    rectangles: NDArray[np.int32], chosen: NDArray[np.bool_], others: NDArray[np.bool_], buffer: Buffer
 ) -> None:
-    """Lay the `window` about the `rectangles` (M, 4) of the `chosen` and the `others` (M,); clear what they reach."""
+    """Lay the window about the `rectangles` (M, 4) of the `chosen` and the `others` (M,); clear what they reach."""
+    window, nearest_w, farthest_w = buffer
     first_row, last_row, first_column, last_column = 2**30, -1, 2**30, -1
     for m in range(len(rectangles)):
         if (chosen[m] or others[m]) and rectangles[m, 0] <= rectangles[m, 1]:
@@ -433,82 +370,45 @@ def open_window(
 
 
 @kernel
-def copy_window(
-    rectangles: NDArray[np.int32],
-    chosen: NDArray[np.bool_],
-    from_window: NDArray[np.int64],
-    from_nearest_w: NDArray[np.float32],
-    from_farthest_w: NDArray[np.float32],
-    window: NDArray[np.int64],
-    nearest_w: NDArray[np.float32],
-    farthest_w: NDArray[np.float32],
-) -> None:
-    """Copy what the `chosen` (M,) of the `rectangles` (M, 4) reach from one window to another, which encloses it."""
-    for y in range(from_window[0], from_window[0] + from_window[2]):
+def copy_window(rectangles: NDArray[np.int32], chosen: NDArray[np.bool_], kept: Buffer, buffer: Buffer) -> None:
+    """Copy what the `chosen` (M,) of the `rectangles` (M, 4) reach into a `buffer` whose window encloses the other."""
+    window = buffer.window
+    for y in range(kept.window[0], kept.window[0] + kept.window[2]):
         first, end = span_of_row(y, rectangles, chosen, chosen)
-        source = (y - from_window[0]) * from_window[3] - from_window[1]
+        source = (y - kept.window[0]) * kept.window[3] - kept.window[1]
         at = (y - window[0]) * window[3] - window[1]
-        nearest_w[at + first : at + end] = from_nearest_w[source + first : source + end]
-        if len(farthest_w) > 0:
-            farthest_w[at + first : at + end] = from_farthest_w[source + first : source + end]
+        buffer.nearest_w[at + first : at + end] = kept.nearest_w[source + first : source + end]
+        if len(buffer.farthest_w) > 0:
+            buffer.farthest_w[at + first : at + end] = kept.farthest_w[source + first : source + end]
 
 
 @kernel
 def draw_meshes(
-    vertices_m: NDArray[np.float32],
-    offsets: NDArray[np.float32],
-    faces: NDArray[np.int32],
-    vertex_starts: NDArray[np.int32],
-    face_starts: NDArray[np.int32],
-    closed: NDArray[np.bool_],
+    meshes: Meshes,
     chosen: NDArray[np.bool_],
     others: NDArray[np.bool_],
     T_camera_mesh: NDArray[np.float64],
     padding_m: NDArray[np.float32],
-    camera: NDArray[np.float32],
-    width: int,
-    height: int,
-    placed: NDArray[np.float32],
-    before: NDArray[np.int32],
-    kinds: NDArray[np.uint8],
-    lists: NDArray[np.int32],
-    corners: NDArray[np.float32],
-    polygon: NDArray[np.float64],
-    kept_window: NDArray[np.int64],
-    kept_nearest_w: NDArray[np.float32],
-    kept_farthest_w: NDArray[np.float32],
-    window: NDArray[np.int64],
-    nearest_w: NDArray[np.float32],
-    farthest_w: NDArray[np.float32],
+    screen: Screen,
+    kept: Buffer,
+    buffer: Buffer,
     rectangles: NDArray[np.int32],
+    scratch: Scratch,
 ) -> None:
-    """Draw the `chosen` (M,) of M meshes over what is kept of the `others`, into nearest and farthest inverse depth.
+    """Draw the `chosen` (M,) of M meshes over what is `kept` of the `others`, into nearest and farthest inverse depth.
 
-    Meshes, poses and `rectangles` as in `project.place_meshes`. Where a mesh is `closed` (M,), only faces turned here
-    (Algorithm 3) are drawn into `nearest_w`, and only those turned away into `farthest_w`. The buffers of 1/m hold,
-    where a rectangle reaches, `window` of the picture, which is laid anew; they have room for H * (W + LANES) + LANES
-    pixels. Where the near plane cuts away the front of a closed mesh, there may be a farthest surface without a
-    nearest. `farthest_w`, kept and new, may be empty: then none is drawn.
-    Scratch: `placed` (6, V), `before` (M,), `kinds` (most faces of a mesh,), `lists` (3, most faces + 1),
-    `corners` (3, 3), `polygon` (4, 3).
+    Poses (M, 4, 4), padding and `rectangles` as in `project.place_meshes`. Of a closed mesh, only faces turned here
+    (Algorithm 3) are drawn into `nearest_w`, and only those turned away into `farthest_w`. The `buffer` holds, where a
+    rectangle reaches, a window of the picture, which is laid anew. Where the near plane cuts away the front of a closed
+    mesh, there may be a farthest surface without a nearest.
     """
-    place_meshes(
-        vertices_m, offsets, faces, vertex_starts, face_starts, chosen, T_camera_mesh, padding_m, camera,
-        width, height, placed, before, corners, polygon, rectangles,
-    )  # fmt: skip
-    open_window(rectangles, chosen, others, window, nearest_w, farthest_w)
-    copy_window(
-        rectangles, others, kept_window, kept_nearest_w, kept_farthest_w, window, nearest_w, farthest_w
-    )  # fmt: skip
-    for m in range(len(closed)):
-        first, end = vertex_starts[m], vertex_starts[m + 1]
-        if not chosen[m] or before[m] == end - first:
+    meshes, screen, scratch = Meshes(*meshes), Screen(*screen), Scratch(*scratch)
+    kept, buffer = Buffer(*kept), Buffer(*buffer)
+    place_meshes(meshes, chosen, T_camera_mesh, padding_m, screen, scratch, rectangles)
+    open_window(rectangles, chosen, others, buffer)
+    copy_window(rectangles, others, kept, buffer)
+    for m in range(len(chosen)):
+        before = scratch.before[m]
+        if not chosen[m] or before == meshes.vertex_starts[m + 1] - meshes.vertex_starts[m]:
             continue
-        a, b, c = faces[0], faces[1], faces[2]
-        start, stop = face_starts[m], face_starts[m + 1]
-        fill_mesh(
-            a[start:stop], b[start:stop], c[start:stop], closed[m], before[m],
-            placed[0, first:end], placed[1, first:end], placed[2, first:end],
-            placed[3, first:end], placed[4, first:end], placed[5, first:end],
-            camera, width, height, window, kinds[: stop - start], lists, corners, polygon, nearest_w, farthest_w,
-        )  # fmt: skip
+        fill_mesh(mesh_of(m, meshes, scratch), meshes.closed[m], before > 0, screen, buffer, scratch)

@@ -10,6 +10,7 @@ only one that is ever measured, and still rare.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,27 +25,54 @@ MODES = 4
 """A pixel at an edge shows two surfaces and the flying depths between; one more for who walks past."""
 
 
+class Modes(NamedTuple):
+    """What is known of each pixel: its `looks` (H, W), and of its modes how often each came, mean and sum of squares.
+
+    `numbers`, `means_m`, `squares_m2` are (H, W, MODES).
+    """
+
+    looks: NDArray[np.uint16]
+    numbers: NDArray[np.uint16]
+    means_m: NDArray[np.float32]
+    squares_m2: NDArray[np.float32]
+
+
+class Matching(NamedTuple):
+    """Depths up to `range_max_m` count; those within `base_m + noise_per_m * z**2` of one another are one surface."""
+
+    depth_scale_m: float
+    range_max_m: float
+    base_m: float
+    noise_per_m: float
+
+
+class Prior(NamedTuple):
+    """A mode counts that holds `share_min` of the looks.
+
+    Its spread is drawn towards `noise_per_m * z**2` as if `weight` frames had shown that.
+    """
+
+    share_min: float
+    weight: float
+    noise_per_m: float
+
+
 @kernel
 def observe(
     depth_raw: NDArray[np.uint16],
     robot_near_raw: NDArray[np.uint16],
     robot_span_raw: NDArray[np.uint16],
-    depth_scale_m: float,
-    range_max_m: float,
-    match_base_m: float,
-    match_noise_per_m: float,
-    looks: NDArray[np.uint16],
-    numbers: NDArray[np.uint16],
-    means_m: NDArray[np.float32],
-    squares_m2: NDArray[np.float32],
+    matching: Matching,
+    modes: Modes,
 ) -> None:
     """Add one frame to the modes of every pixel (Welford's running mean and sum of squares).
 
     What lies inside the robot's band, or is unmeasured where the robot stands, is no look at what is behind it.
-    Depths that are absent or beyond the range are a look that showed nothing. Any other depth joins the mode within
-    `base + noise * z**2` of it, or starts one, in the place of the rarest when all are taken.
-    `looks` is (H, W); `numbers`, `means_m`, `squares_m2` are (H, W, MODES).
+    Depths that are absent or beyond the range are a look that showed nothing. Any other depth joins the mode that it
+    matches, or starts one, in the place of the rarest when all are taken.
     """
+    depth_scale_m, range_max_m, match_base_m, match_noise_per_m = Matching(*matching)
+    looks, numbers, means_m, squares_m2 = Modes(*modes)
     height, width = depth_raw.shape
     for y in range(height):
         for x in range(width):
@@ -89,23 +117,15 @@ def students_excess(freedom: float) -> float:
 
 
 @kernel
-def conclude(
-    looks: NDArray[np.uint16],
-    numbers: NDArray[np.uint16],
-    means_m: NDArray[np.float32],
-    squares_m2: NDArray[np.float32],
-    share_min: float,
-    prior_weight: float,
-    prior_noise_per_m: float,
-    reference_m: NDArray[np.float32],
-    spread_m: NDArray[np.float32],
-) -> None:
-    """The nearest mode that holds at least `share_min` of a pixel's looks, and its standard deviation.
+def conclude(modes: Modes, prior: Prior, reference_m: NDArray[np.float32], spread_m: NDArray[np.float32]) -> None:
+    """The nearest mode that is not rare among a pixel's looks, and its standard deviation.
 
-    The spread is drawn towards the camera's model `noise * z**2` as if `prior_weight` frames had shown it, for the
-    spread of few frames is no measure, and widened as Student's t has it. `reference_m`, `spread_m` (H, W) are NaN
+    The spread is drawn towards the camera's model, for that of few frames is no measure, and widened as Student's t has
+    it. `reference_m`, `spread_m` (H, W) are NaN
     where nothing was learned.
     """
+    looks, numbers, means_m, squares_m2 = Modes(*modes)
+    share_min, prior_weight, prior_noise_per_m = Prior(*prior)
     height, width = reference_m.shape
     for y in range(height):
         for x in range(width):

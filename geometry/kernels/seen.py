@@ -8,12 +8,13 @@ is nearer than everything that could hide an obstacle: the static limit and the 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geometry.kernels.jit import kernel
-from geometry.kernels.pinhole import moved, project, rows_of
+from geometry.kernels.pinhole import Camera, moved, project, rows_of
 
 RAYS_PER_SIDE = 6
 """A block is probed by a grid of about 6 x 6 of its pixels: 5 % of them decide nothing, and it costs little."""
@@ -23,30 +24,58 @@ BLOCKED_MAX = 1
 """Rays that may end before a block's far side: one is noise, more may be a finger that is too thin to be reported."""
 
 
+class Blocks(NamedTuple):
+    """Blocks of `size_m` that fill `shape` (3,) from `origin_m` (3,), numbered `(ix*ny + iy)*nz + iz`."""
+
+    shape: NDArray[np.int32]
+    size_m: float
+    origin_m: NDArray[np.float64]
+
+
+class Measuring(NamedTuple):
+    """What a depth camera measures: from `near_m` on, with a noise of `noise_per_m * z**2`, in `depth_scale_m`."""
+
+    near_m: float
+    noise_per_m: float
+    depth_scale_m: float
+
+
+class Views(NamedTuple):
+    """Of each block that lies wholly in the picture its number in `blocks`, and in `views` (., 5) what it covers.
+
+    That is first and last row, first and last column, and the raw depth of its far corner plus the noise there: what
+    stands just inside may be measured that much behind.
+    """
+
+    blocks: NDArray[np.int32]
+    views: NDArray[np.int32]
+
+
+class Rectangle(NamedTuple):
+    """Of the rows that are looked at, and of the columns."""
+
+    first_row: int
+    last_row: int
+    first_column: int
+    last_column: int
+
+
+class Looking(NamedTuple):
+    """Every `rows_apart`-th row is looked at; `reach_raw` (H / rows_apart, rounded up, W) is scratch."""
+
+    rows_apart: int
+    reach_raw: NDArray[np.uint16]
+
+
 @kernel
 def block_views(
-    shape: NDArray[np.int32],
-    block_size_m: float,
-    T_camera_world: NDArray[np.float64],
-    origin_m: NDArray[np.float64],
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    width: int,
-    height: int,
-    near_m: float,
-    noise_per_m: float,
-    depth_scale_m: float,
-    blocks: NDArray[np.int32],
-    views: NDArray[np.int32],
+    grid: Blocks, T_camera_world: NDArray[np.float64], camera: Camera, measuring: Measuring, views: Views
 ) -> int:
-    """List the blocks that lie wholly in the picture, with the rectangle that each covers; returns how many.
-
-    Blocks of `block_size_m` fill `shape` (3,) from `origin_m` (3,), numbered `(ix*ny + iy)*nz + iz`. Out, per listed
-    block: `blocks` its number; `views` (., 5) first and last row, first and last column, raw depth of its far corner
-    plus the noise `noise_per_m * z**2` there: what stands just inside may be measured that much behind.
-    """
+    """List the blocks that lie wholly in the picture in `views`; returns how many."""
+    grid, camera, measuring, views = Blocks(*grid), Camera(*camera), Measuring(*measuring), Views(*views)
+    shape, block_size_m, origin_m = grid
+    near_m, noise_per_m, depth_scale_m = measuring
+    blocks, rectangles = views
     rows = rows_of(T_camera_world)
     number = 0
     for ix in range(shape[0]):
@@ -63,20 +92,20 @@ def block_views(
                     z_high = max(z_high, z)
                     if z < near_m:
                         break
-                    u, v = project(x, y, 1.0 / z, fx, fy, cx, cy)
+                    u, v = project(x, y, 1.0 / z, camera)
                     u_low, u_high = min(u_low, u), max(u_high, u)
                     v_low, v_high = min(v_low, v), max(v_high, v)
                 far_raw = math.ceil((z_high + noise_per_m * z_high * z_high) / depth_scale_m)
                 if z_low < near_m or far_raw > 65535 or u_low < 0.0 or v_low < 0.0:
                     continue
-                if u_high > width - 1 or v_high > height - 1:
+                if u_high > camera.width - 1 or v_high > camera.height - 1:
                     continue
                 blocks[number] = (ix * shape[1] + iy) * shape[2] + iz
-                views[number, 0] = math.floor(v_low)
-                views[number, 1] = math.ceil(v_high)
-                views[number, 2] = math.floor(u_low)
-                views[number, 3] = math.ceil(u_high)
-                views[number, 4] = far_raw
+                rectangles[number, 0] = math.floor(v_low)
+                rectangles[number, 1] = math.ceil(v_high)
+                rectangles[number, 2] = math.floor(u_low)
+                rectangles[number, 3] = math.ceil(u_high)
+                rectangles[number, 4] = far_raw
                 number += 1
     return number
 
@@ -94,19 +123,12 @@ def reach_of_row(
 
 
 @kernel
-def passes(
-    reach_raw: NDArray[np.uint16],
-    first_row: int,
-    last_row: int,
-    first_column: int,
-    last_column: int,
-    far_raw: int,
-    share_min: float,
-) -> bool:
+def passes(reach_raw: NDArray[np.uint16], rectangle: Rectangle, far_raw: int, share_min: float) -> bool:
     """Whether at least `share_min` of the rays that are probed inside a rectangle reach `far_raw`.
 
     Of the others any may be unmeasured, but at most `BLOCKED_MAX` may end before it: a thin thing blocks few.
     """
+    first_row, last_row, first_column, last_column = rectangle
     row_step = max((last_row - first_row) // RAYS_PER_SIDE, 1)
     column_step = np.uint64(max((last_column - first_column) // RAYS_PER_SIDE, 1))
     rows = (last_row - first_row) // row_step + 1
@@ -135,24 +157,24 @@ def seen_blocks(
     depth_raw: NDArray[np.uint16],
     static_limit_raw: NDArray[np.uint16],
     robot_near_raw: NDArray[np.uint16],
-    blocks: NDArray[np.int32],
-    views: NDArray[np.int32],
+    views: Views,
     number: int,
     share_min: float,
-    rows_apart: int,
-    reach_raw: NDArray[np.uint16],
+    looking: Looking,
     seen: NDArray[np.uint8],
 ) -> None:
     """Set `seen` (all blocks,) to 1 for the blocks through which at least `share_min` of the probed rays pass, else 0.
 
-    Images are (H, W); `blocks` and `views` are those of `block_views`, of which `number` count. Only every
-    `rows_apart`-th row is looked at. Scratch: `reach_raw` (H / rows_apart, rounded up, W).
+    Images are (H, W); `views` are those of `block_views`, of which `number` count.
     """
+    rows_apart, reach_raw = Looking(*looking)
+    blocks, rectangles = Views(*views)
     for y in range(len(reach_raw)):
         row = y * rows_apart
         # An unmeasured pixel has depth 0 and passes nothing.
         reach_of_row(depth_raw[row], static_limit_raw[row], robot_near_raw[row], reach_raw[y])
     seen[:] = 0
     for i in range(number):
-        first_row, last_row = views[i, 0] // rows_apart, views[i, 1] // rows_apart
-        seen[blocks[i]] = passes(reach_raw, first_row, last_row, views[i, 2], views[i, 3], views[i, 4], share_min)
+        first_row, last_row = rectangles[i, 0] // rows_apart, rectangles[i, 1] // rows_apart
+        rectangle = Rectangle(first_row, last_row, rectangles[i, 2], rectangles[i, 3])
+        seen[blocks[i]] = passes(reach_raw, rectangle, rectangles[i, 4], share_min)

@@ -8,6 +8,8 @@ no test for the lattice's end. A *slot* is a place in it: that of voxel (ix, iy,
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,32 +19,97 @@ PIXELS_PER_WORD = 8
 """A row of the mask is read as words of 64 bits: eight empty pixels are skipped at once."""
 
 
+class Grid(NamedTuple):
+    """The lattice before one camera, in units of voxels, with the camera's pose folded in.
+
+    A pixel at column u, row v and raw depth d lies at `(column_rays[:, u] + row_rays[v]) * d + origin`;
+    `column_rays` (3, W), `row_rays` (H, 3), `origin` (3,). `shape` (3,) is the lattice's.
+    """
+
+    column_rays: NDArray[np.float32]
+    row_rays: NDArray[np.float32]
+    origin: NDArray[np.float32]
+    shape: NDArray[np.int32]
+
+
+class Mask(NamedTuple):
+    """The pixels that are marked: rows of `pixels` (., stride), and the same memory as `words` (., stride / 8)."""
+
+    words: NDArray[np.uint64]
+    pixels: NDArray[np.uint8]
+
+
+class Counter(NamedTuple):
+    """`counts` of `(nx + 2) * (ny + 2) * (nz + 2) + 1` slots, zero before the first call.
+
+    Slots that become non-zero are listed in `touched`, which is one longer than the most that may be; by it `forget`
+    makes them zero again. `slots` (W,) is scratch.
+    """
+
+    counts: NDArray[np.uint32]
+    touched: NDArray[np.uint32]
+    slots: NDArray[np.int32]
+
+
+class Rays(NamedTuple):
+    """The column's part of the rays of a stretch of a row."""
+
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    z: NDArray[np.float32]
+
+
+class Ray(NamedTuple):
+    """The row's part of them."""
+
+    x: np.float32
+    y: np.float32
+    z: np.float32
+
+
+class Steps(NamedTuple):
+    """The grid and the counter as scalars, which stay in registers."""
+
+    origin_x: np.float32
+    origin_y: np.float32
+    origin_z: np.float32
+    limit_x: np.float32
+    limit_y: np.float32
+    limit_z: np.float32
+    slots_per_y: np.int32
+    slots_per_x: np.int32
+    first_slot: np.int32
+    outside: np.int32
+
+
+@kernel
+def steps_of(grid: Grid, counter: Counter) -> Steps:
+    """The grid and the counter as scalars."""
+    origin, shape = grid.origin, grid.shape
+    slots_per_y = np.int32(shape[2] + 2)
+    slots_per_x = np.int32(slots_per_y * (shape[1] + 2))
+    return Steps(
+        origin[0], origin[1], origin[2], np.float32(shape[0]), np.float32(shape[1]), np.float32(shape[2]),
+        slots_per_y, slots_per_x, np.int32(slots_per_x + slots_per_y + 1), np.int32(len(counter.counts) - 1),
+    )  # fmt: skip
+
+
 @kernel
 def slots_of_row(
     depth_raw: NDArray[np.uint16],
     mask: NDArray[np.uint8],
-    ray_x: NDArray[np.float32],
-    ray_y: NDArray[np.float32],
-    ray_z: NDArray[np.float32],
-    row_x: np.float32,
-    row_y: np.float32,
-    row_z: np.float32,
-    origin_x: np.float32,
-    origin_y: np.float32,
-    origin_z: np.float32,
-    limit_x: np.float32,
-    limit_y: np.float32,
-    limit_z: np.float32,
-    slots_per_y: np.int32,
-    slots_per_x: np.int32,
-    first_slot: np.int32,
-    outside: np.int32,
+    rays: Rays,
+    row: Ray,
+    steps: Steps,
     slots: NDArray[np.int32],
 ) -> None:
     """The slot of each pixel of a stretch of a row; written for the vectoriser: no branch, 32 bits, nothing but arrays.
 
     `outside` for a pixel that is not marked and for a point outside the lattice.
     """
+    ray_x, ray_y, ray_z = rays
+    row_x, row_y, row_z = row
+    origin_x, origin_y, origin_z, limit_x, limit_y, limit_z, slots_per_y, slots_per_x, first_slot, outside = steps
     zero = np.float32(0.0)
     for i in range(len(depth_raw)):
         d = np.float32(depth_raw[i])
@@ -93,64 +160,29 @@ def next_empty(words: NDArray[np.uint64], start: int) -> int:
 
 
 @kernel
-def count_points(
-    depth_raw: NDArray[np.uint16],
-    mask_words: NDArray[np.uint64],
-    mask: NDArray[np.uint8],
-    column_rays: NDArray[np.float32],
-    row_rays: NDArray[np.float32],
-    origin: NDArray[np.float32],
-    shape: NDArray[np.int32],
-    slots: NDArray[np.int32],
-    counts: NDArray[np.uint32],
-    touched: NDArray[np.uint32],
-    found: int,
-) -> int:
+def count_points(depth_raw: NDArray[np.uint16], mask: Mask, grid: Grid, counter: Counter, found: int) -> int:
     """Deproject the marked pixels onto the lattice and count them; returns how many voxels were touched until now.
 
-    In units of voxels, with the camera's pose folded in: a pixel at column u, row v and raw depth d lies
-    at `(column_rays[:, u] + row_rays[v]) * d + origin`; `column_rays` (3, W), `row_rays` (H, 3), `origin` (3,).
-    `mask` (at least H, stride) is also handed in as `mask_words` (., stride / 8). `slots` (W,) is scratch.
-    `counts` has `(nx + 2) * (ny + 2) * (nz + 2) + 1` slots and is zero before the first call; slots that become
-    non-zero are listed in `touched` (one longer than the most that may be) behind the `found` that are there, and by
-    it `forget` makes them zero again.
+    They are listed behind the `found` that were there before.
     """
+    mask, grid, counter = Mask(*mask), Grid(*grid), Counter(*counter)
     height, width = depth_raw.shape
-    words = mask_words.shape[1]
-    slots_per_y = np.int32(shape[2] + 2)
-    slots_per_x = np.int32(slots_per_y * (shape[1] + 2))
-    first_slot = np.int32(slots_per_x + slots_per_y + 1)
-    outside = np.int32(len(counts) - 1)
+    words = mask.words.shape[1]
+    steps = steps_of(grid, counter)
+    rays_x, rays_y, rays_z = grid.column_rays[0], grid.column_rays[1], grid.column_rays[2]
+    counts, touched, slots = counter
     # Never zero, so that it is never listed.
-    counts[outside] = 1
+    counts[steps.outside] = 1
     for y in range(height):
-        row = mask_words[y]
+        row = mask.words[y]
+        ray = Ray(grid.row_rays[y, 0], grid.row_rays[y, 1], grid.row_rays[y, 2])
         word = next_marked(row, 0)
         while word < words:
             first = PIXELS_PER_WORD * word
             word = next_empty(row, word)
             end = min(PIXELS_PER_WORD * word, width)
-            slots_of_row(
-                depth_raw[y, first:end],
-                mask[y, first:end],
-                column_rays[0, first:end],
-                column_rays[1, first:end],
-                column_rays[2, first:end],
-                row_rays[y, 0],
-                row_rays[y, 1],
-                row_rays[y, 2],
-                origin[0],
-                origin[1],
-                origin[2],
-                np.float32(shape[0]),
-                np.float32(shape[1]),
-                np.float32(shape[2]),
-                slots_per_y,
-                slots_per_x,
-                first_slot,
-                outside,
-                slots[first:end],
-            )
+            rays = Rays(rays_x[first:end], rays_y[first:end], rays_z[first:end])
+            slots_of_row(depth_raw[y, first:end], mask.pixels[y, first:end], rays, ray, steps, slots[first:end])
             found = tally(slots[first:end], counts, touched, found)
             word = next_marked(row, word)
     return found

@@ -7,6 +7,7 @@ In the order of the flow:
     hull_store      hulls kept on disk
     padded_hull     a link as the solid that reaches a few centimetres around it
     link_poses      the robot's links as they stand before one camera
+    kernel_camera   a camera's intrinsics as kernels take them
     mesh_renderer   meshes and links drawn into buffers of inverse depth
 """
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geometry.kernels import forward
+from geometry.kernels.bundles import plain
 from shared.kinematics import Robot
 from shared.transforms import Transform
 
@@ -17,11 +18,26 @@ class Links:
     def __init__(self, robot: Robot, T_camera_world: Transform) -> None:
         self._robot = robot
         self._T_camera_base = T_camera_world @ robot.T_world_base
-        self._table = robot.link_table
+        table = robot.link_table
+        self._moving = plain(
+            forward.Moving(
+                table.parent,
+                table.dof,
+                table.multiplier,
+                table.offset,
+                table.is_turning,
+                table.axis,
+                table.fixed,
+                table.sine,
+                table.versine,
+                table.shift,
+            )
+        )
+        self._carried = plain(forward.Carried(table.body, table.T_body_link, table.chain, table.corners))
         count = len(robot.links)
-        self._local = np.empty((4, 4))
-        self._bodies = np.empty((len(self._table.parent) + 1, 4, 4))
         self._poses = np.empty((count, 4, 4))
+        bodies, local = np.empty((len(table.parent) + 1, 4, 4)), np.empty((4, 4))
+        self._stand = plain(forward.Stand(self._poses, bodies, local))
         self._displacement_m = np.empty(count)
 
     def place(self, joints: ArrayLike) -> NDArray[np.float64]:
@@ -30,25 +46,8 @@ class Links:
         Raises:
             InputError: wrong number of joints, or one is not finite.
         """
-        table = self._table
-        forward.place_links(
-            np.array(self._robot.check_joints(joints)),
-            self._T_camera_base,
-            table.parent,
-            table.dof,
-            table.multiplier,
-            table.offset,
-            table.is_turning,
-            table.fixed,
-            table.sine,
-            table.versine,
-            table.shift,
-            table.body,
-            table.T_body_link,
-            self._local,
-            self._bodies,
-            self._poses,
-        )
+        positions = np.array(self._robot.check_joints(joints))
+        forward.place_links(positions, self._T_camera_base, self._moving, self._carried, self._stand)
         return self._poses
 
     def displacement_m(self, uncertainty: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -56,17 +55,5 @@ class Links:
 
         Valid until the next call; see `Robot.displacement_m`.
         """
-        table = self._table
-        forward.displace_links(
-            uncertainty,
-            table.dof,
-            table.multiplier,
-            table.is_turning,
-            table.axis,
-            table.chain,
-            table.corners,
-            self._bodies,
-            self._poses,
-            self._displacement_m,
-        )
+        forward.displace_links(uncertainty, self._moving, self._carried, self._stand, self._displacement_m)
         return self._displacement_m

@@ -10,6 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.kernels import motion, rasterize
+from geometry.kernels.bundles import plain
+from geometry.kernels.project import Meshes, Scratch
+from geometry.kernels.rasterize import Buffer
+from geometry.rendering.kernel_camera import screen_of
 from geometry.rendering.vertex_offsets import vertex_offsets
 from shared.camera import Intrinsics
 from shared.meshes import TriangleMesh
@@ -28,7 +32,11 @@ early: a robot that stops and goes by turns would have everything drawn twice.""
 
 
 class DepthBuffer:
-    """Nearest and farthest inverse depth, 1/m, of a window of the picture, as `rasterize` has it."""
+    """Nearest and farthest inverse depth, 1/m, of a window of the picture, as `rasterize` has it.
+
+    Attributes:
+        bundle: all of it, for kernels.
+    """
 
     def __init__(self, intrinsics: Intrinsics, farthest: bool = False) -> None:
         """Without `farthest` only the nearest is drawn."""
@@ -36,6 +44,7 @@ class DepthBuffer:
         self.nearest_w = np.zeros(size, np.float32)
         self.farthest_w = np.zeros(size if farthest else 0, np.float32)
         self.window = np.zeros(4, np.int64)
+        self.bundle = plain(Buffer(self.window, self.nearest_w, self.farthest_w))
 
     def nearest_in(self, picture_w: NDArray[np.float32], rectangles: NDArray[np.int32]) -> None:
         """Write what was drawn inside the `rectangles` (M, 4) into `picture_w` (H, W)."""
@@ -54,24 +63,30 @@ class MeshBatch:
         self.count = len(meshes)
         self.all = np.ones(self.count, np.bool_)
         self.rectangles = np.tile(np.array([intrinsics.height, -1, intrinsics.width, -1], np.int32), (self.count, 1))
-        self._intrinsics = intrinsics
-        self._camera = np.array(
-            (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, NEAR_PLANE_M), np.float32
-        )  # fmt: skip
+        self._screen = screen_of(intrinsics, NEAR_PLANE_M)
         offsets = [vertex_offsets(mesh) if inflate else np.zeros_like(mesh.vertices) for mesh in meshes]
-        self._vertices_m = _columns([mesh.vertices for mesh in meshes], np.float32)
-        self._offsets = _columns(offsets, np.float32)
-        self._faces = _columns([mesh.faces for mesh in meshes], np.int32)
-        self._vertex_starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)]).astype(np.int32)
-        self._face_starts = np.cumsum([0, *(len(mesh.faces) for mesh in meshes)]).astype(np.int32)
-        self._closed = np.array([mesh.closed for mesh in meshes], np.bool_)
+        vertices_m = _columns([mesh.vertices for mesh in meshes], np.float32)
+        self._meshes = plain(
+            Meshes(
+                vertices_m,
+                offsets=_columns(offsets, np.float32),
+                faces=_columns([mesh.faces for mesh in meshes], np.int32),
+                vertex_starts=np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)]).astype(np.int32),
+                face_starts=np.cumsum([0, *(len(mesh.faces) for mesh in meshes)]).astype(np.int32),
+                closed=np.array([mesh.closed for mesh in meshes], np.bool_),
+            )
+        )
         faces_max = max((len(mesh.faces) for mesh in meshes), default=1)
-        self._placed = np.empty((6, self._vertices_m.shape[1]), np.float32)
-        self._before = np.zeros(self.count, np.int32)
-        self._kinds = np.empty(faces_max, np.uint8)
-        self._lists = np.empty((3, faces_max + 1), np.int32)
-        self._corners = np.empty((3, 3), np.float32)
-        self._polygon = np.empty((4, 3), np.float64)
+        self._scratch = plain(
+            Scratch(
+                placed=np.empty((6, vertices_m.shape[1]), np.float32),
+                before=np.zeros(self.count, np.int32),
+                kinds=np.empty(faces_max, np.uint8),
+                lists=np.empty((3, faces_max + 1), np.int32),
+                corners=np.empty((3, 3), np.float32),
+                polygon=np.empty((4, 3), np.float64),
+            )
+        )
 
     def draw(self, T_camera_mesh: NDArray[np.float64], padding_m: NDArray[np.float32], buffer: DepthBuffer) -> None:
         """Draw all meshes at poses (M, 4, 4), each grown by its padding (M,), into `buffer`."""
@@ -88,32 +103,16 @@ class MeshBatch:
     ) -> None:
         """Draw the `chosen` (M,) of the meshes over what is `kept` of the `others` (M,)."""
         rasterize.draw_meshes(
-            self._vertices_m,
-            self._offsets,
-            self._faces,
-            self._vertex_starts,
-            self._face_starts,
-            self._closed,
+            self._meshes,
             chosen,
             others,
             T_camera_mesh,
             padding_m,
-            self._camera,
-            self._intrinsics.width,
-            self._intrinsics.height,
-            self._placed,
-            self._before,
-            self._kinds,
-            self._lists,
-            self._corners,
-            self._polygon,
-            kept.window,
-            kept.nearest_w,
-            kept.farthest_w,
-            buffer.window,
-            buffer.nearest_w,
-            buffer.farthest_w,
+            self._screen,
+            kept.bundle,
+            buffer.bundle,
             self.rectangles,
+            self._scratch,
         )
 
 
@@ -134,10 +133,17 @@ class LinkDrawing:
         self._kept = DepthBuffer(intrinsics, farthest)
         self._is_kept = np.zeros(self._batch.count, np.bool_)
         self._is_drawn = np.zeros(self._batch.count, np.bool_)
-        self._still_for = np.zeros(self._batch.count, np.int64)
-        # Nowhere yet.
-        self._poses = np.full((self._batch.count, 4, 4), np.nan)
-        self._padding_m = np.zeros(self._batch.count, np.float32)
+        self._stillness = plain(motion.Stillness(STILL_M, KEPT_AFTER))
+        self._drawn = plain(
+            motion.Drawn(
+                # Nowhere yet.
+                poses=np.full((self._batch.count, 4, 4), np.nan),
+                padding_m=np.zeros(self._batch.count, np.float32),
+                still_for=np.zeros(self._batch.count, np.int64),
+                is_kept=self._is_kept,
+                is_drawn=self._is_drawn,
+            )
+        )
 
     @property
     def rectangles(self) -> NDArray[np.int32]:
@@ -158,14 +164,9 @@ class LinkDrawing:
             T_camera_link,
             padding_m,
             self._reach_m,
-            STILL_M,
-            KEPT_AFTER,
+            self._stillness,
             anew,
-            self._poses,
-            self._padding_m,
-            self._still_for,
-            self._is_kept,
-            self._is_drawn,
+            self._drawn,
         )
         if found == motion.STILL:
             return False

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,6 +38,9 @@ POWER_ON_S = 30.0
 
 COMMAND_S = 20.0
 """For a command in a machine."""
+
+TOOLS = {"systemd-nspawn": "systemd-container", "nsenter": "util-linux", "ip": "iproute2"}
+"""What containers and their network take, and the package that it is in."""
 
 NAMESPACES = ("unshare", "--net", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc")
 
@@ -71,9 +74,8 @@ def why_not() -> str | None:
     """Why no machine can be run here, in one sentence; None where they can."""
     if os.geteuid() != 0:
         return "only root may run containers"
-    for command in ("systemd-nspawn", "nsenter", "ip"):
-        if shutil.which(command) is None:
-            return f"{command} is not installed"
+    if (missing := missing_packages(TOOLS)) is not None:
+        return missing
     if not allowed(NAMESPACES):
         return "the kernel does not allow network, mount and process namespaces"
     if (trouble := container_trouble()) is not None:
@@ -82,6 +84,12 @@ def why_not() -> str | None:
     if subprocess.run(bridge, capture_output=True, check=False).returncode:
         return "the kernel has no bridge"
     return None
+
+
+def missing_packages(tools: Mapping[str, str]) -> str | None:
+    """How to get all packages of which a command is not here, in one sentence; None where there is none."""
+    packages = sorted({package for command, package in tools.items() if shutil.which(command) is None})
+    return f"missing: apt-get install {' '.join(packages)}" if packages else None
 
 
 def container_trouble() -> str | None:

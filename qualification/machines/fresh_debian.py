@@ -14,7 +14,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -286,8 +286,3 @@ def _same(source: Path, target: Path) -> bool:
 def _remove(folder: Path) -> None:
     if folder.exists():
         shutil.rmtree(folder)
-
-
-def missing_packages(tools: Mapping[str, str]) -> Iterable[str]:
-    """The packages of those commands that are not here."""
-    return sorted({package for command, package in tools.items() if shutil.which(command) is None})

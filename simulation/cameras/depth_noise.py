@@ -14,13 +14,17 @@ from __future__ import annotations
 import math
 from functools import cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.special import ndtri
 
+from geometry.kernels.bundles import plain
 from geometry.kernels.jit import kernel
+from geometry.kernels.pinhole import Camera
+from geometry.rendering.kernel_camera import camera_of
 from shared.camera import Intrinsics
 
 STEP_BASE_M, STEP_SHARE = 0.03, 0.04
@@ -112,6 +116,45 @@ class DepthNoise(BaseModel):
         return np.asarray(gain * np.exp(level) * z_m**2)
 
 
+class Faults(NamedTuple):
+    """What `measure` does to a frame: those of `DepthNoise` as it reckons with them.
+
+    `focal_baseline` in px·m. A pixel's deviation is a sum of its own noise and the smooth one, by their weights. Holes
+    lie where their field is above `hole_level`.
+    """
+
+    focal_baseline: float
+    depth_scale_m: float
+    pixel_weight: float
+    smooth_weight: float
+    disparity_step_px: float
+    disparity_max_px: float
+    range_max_m: float
+    flying_share: float
+    flying_px: int
+    shadow: bool
+    grazing_cos: float
+    hole_level: float
+
+
+class Chance(NamedTuple):
+    """A frame's chance: `smooth` and `blobs` (H, W), fields of unit variance, the table `gauss`, and a `key`."""
+
+    smooth: NDArray[np.float32]
+    blobs: NDArray[np.float32]
+    gauss: NDArray[np.float32]
+    key: np.uint64
+
+
+class Sides(NamedTuple):
+    """How much deeper a surface gets over one pixel, on either side and above and below."""
+
+    from_left: float
+    to_right: float
+    from_above: float
+    to_below: float
+
+
 class DepthSensor:
     """Turns what a perfect camera would see into what a depth camera delivers."""
 
@@ -151,15 +194,22 @@ class DepthSensor:
         if noise.halo_m:
             grow_near(z_m, self._blobs, noise.halo_m * camera.fx, noise.halo_ragged, self._grown_m)
         depth = np.empty(camera.shape, dtype=np.uint16)
-        measure(
-            self._grown_m, self._smooth, self._blobs, self._sigma_m, self._gauss, key,
-            camera.fx, camera.fy, camera.cx, camera.cy,
-            camera.stereo_focal_px * camera.stereo_baseline_m, camera.depth_scale_m,
-            math.sqrt(noise.pixel_share), math.sqrt(1.0 - noise.pixel_share),
-            noise.disparity_step_px, noise.disparity_max_px or np.inf, noise.range_max_m or np.inf,
-            noise.flying_share, noise.flying_px, noise.shadow, math.cos(math.radians(noise.grazing_from_deg)),
-            float(ndtri(1.0 - noise.hole_share)), depth,
-        )  # fmt: skip
+        faults = Faults(
+            focal_baseline=camera.stereo_focal_px * camera.stereo_baseline_m,
+            depth_scale_m=camera.depth_scale_m,
+            pixel_weight=math.sqrt(noise.pixel_share),
+            smooth_weight=math.sqrt(1.0 - noise.pixel_share),
+            disparity_step_px=noise.disparity_step_px,
+            disparity_max_px=noise.disparity_max_px or np.inf,
+            range_max_m=noise.range_max_m or np.inf,
+            flying_share=noise.flying_share,
+            flying_px=noise.flying_px,
+            shadow=noise.shadow,
+            grazing_cos=math.cos(math.radians(noise.grazing_from_deg)),
+            hole_level=float(ndtri(1.0 - noise.hole_share)),
+        )
+        chance = plain(Chance(self._smooth, self._blobs, self._gauss, key))
+        measure(self._grown_m, chance, self._sigma_m, camera_of(camera), plain(faults), depth)
         return depth
 
 
@@ -258,36 +308,21 @@ def grow_near(
 @kernel
 def measure(
     z_m: NDArray[np.float32],
-    smooth: NDArray[np.float32],
-    blobs: NDArray[np.float32],
+    chance: Chance,
     sigma_m: NDArray[np.float32],
-    gauss: NDArray[np.float32],
-    key: np.uint64,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    focal_baseline: float,
-    depth_scale_m: float,
-    pixel_weight: float,
-    smooth_weight: float,
-    disparity_step_px: float,
-    disparity_max_px: float,
-    range_max_m: float,
-    flying_share: float,
-    flying_px: int,
-    shadow: bool,
-    grazing_cos: float,
-    hole_level: float,
+    camera: Camera,
+    faults: Faults,
     depth: NDArray[np.uint16],
 ) -> None:
     """Measure what stands at `z_m` (H, W) float32 metres (inf: nothing) into `depth` (H, W).
 
-    `smooth` and `blobs` (H, W) are fields of unit variance; holes lie where the second is above `hole_level`.
-    `sigma_m` over depth in steps of `SIGMA_STEP_M`; `focal_baseline` in px·m.
+    `sigma_m` over depth in steps of `SIGMA_STEP_M`.
     """
-    height, width = z_m.shape
-    flying_below = np.uint64(flying_share * 65536.0)
+    smooth, blobs, gauss, key = Chance(*chance)
+    camera, faults = Camera(*camera), Faults(*faults)
+    fx, fy, cx, cy, width, height = camera
+    focal_baseline, depth_scale_m = faults.focal_baseline, faults.depth_scale_m
+    flying_below = np.uint64(faults.flying_share * 65536.0)
     raw_max = 65535.0 * depth_scale_m
     sigma_last = len(sigma_m) - 1
     low16 = np.uint64(0xFFFF)
@@ -301,31 +336,32 @@ def measure(
             if z == np.inf:
                 continue
             disparity = focal_baseline / z
-            if shadow:
+            if faults.shadow:
                 seen_at = x - disparity
                 if seen_at >= leftmost:
                     continue
                 leftmost = seen_at
-            if blobs[y, x] > hole_level:
+            if blobs[y, x] > faults.hole_level:
                 continue
             bits = mix(key + np.uint64(y * width + x))
             gauss_bits = bits & low16
             flying_bits = (bits >> np.uint64(16)) & low16
             between_bits = (bits >> np.uint64(32)) & low16
             grazing_bits = bits >> np.uint64(48)
-            if grazing_cos > 0.0:
+            if faults.grazing_cos > 0.0:
                 left, right = z_m[y, max(x - 1, 0)], z_m[y, min(x + 1, width - 1)]
                 above, below = z_m[max(y - 1, 0), x], z_m[min(y + 1, height - 1), x]
                 # The flatter side: the other may be an edge.
                 slope_x = fx * min(abs(z - left), abs(z - right))
                 slope_y = fy * min(abs(z - above), abs(z - below))
                 if slope_x * slope_x + slope_y * slope_y > 4.0 * z * z:
-                    cos = incidence_cos(z, z - left, right - z, z - above, below - z, fx, fy, (x - cx) / fx, ray_y)
-                    if cos * 65536.0 < grazing_cos * grazing_bits:
+                    sides = Sides(z - left, right - z, z - above, below - z)
+                    cos = incidence_cos(z, sides, camera, (x - cx) / fx, ray_y)
+                    if cos * 65536.0 < faults.grazing_cos * grazing_bits:
                         continue
             if flying_bits < flying_below:
                 nearest, farthest = z, z
-                for k in range(1, flying_px + 1):
+                for k in range(1, faults.flying_px + 1):
                     for other in (
                         z_m[y, max(x - k, 0)],
                         z_m[y, min(x + k, width - 1)],
@@ -341,38 +377,29 @@ def measure(
                         continue
                     z = focal_baseline / disparity
             sigma = sigma_m[min(int(z * (1.0 / SIGMA_STEP_M) + 0.5), sigma_last)]
-            deviation = pixel_weight * gauss[gauss_bits] + smooth_weight * smooth[y, x]
+            deviation = faults.pixel_weight * gauss[gauss_bits] + faults.smooth_weight * smooth[y, x]
             disparity += deviation * sigma * disparity / z
-            if disparity_step_px > 0.0:
-                disparity = disparity_step_px * np.rint(disparity / disparity_step_px)
-            if disparity <= 0.0 or disparity > disparity_max_px:
+            if faults.disparity_step_px > 0.0:
+                disparity = faults.disparity_step_px * np.rint(disparity / faults.disparity_step_px)
+            if disparity <= 0.0 or disparity > faults.disparity_max_px:
                 continue
             measured = focal_baseline / disparity
-            if measured <= range_max_m and measured <= raw_max:
+            if measured <= faults.range_max_m and measured <= raw_max:
                 depth[y, x] = np.uint16(measured / depth_scale_m + 0.5)
 
 
 @kernel
-def incidence_cos(
-    z: float,
-    from_left: float,
-    to_right: float,
-    from_above: float,
-    to_below: float,
-    fx: float,
-    fy: float,
-    ray_x: float,
-    ray_y: float,
-) -> float:
+def incidence_cos(z: float, sides: Sides, camera: Camera, ray_x: float, ray_y: float) -> float:
     """Cosine between a pixel's ray (ray_x, ray_y, 1) and the normal of its surface, from depth differences.
 
     A plane's 1/z is linear on the screen, and its normal is that plane's gradient; so the differences may be taken
     over the flatter side, one pixel wide.
     """
+    from_left, to_right, from_above, to_below = sides
     dx = from_left if abs(from_left) < abs(to_right) else to_right
     dy = from_above if abs(from_above) < abs(to_below) else to_below
-    normal_x = -fx * dx / z
-    normal_y = -fy * dy / z
+    normal_x = -camera.fx * dx / z
+    normal_y = -camera.fy * dy / z
     normal_z = 1.0 - ray_x * normal_x - ray_y * normal_y
     length = math.sqrt((normal_x**2 + normal_y**2 + normal_z**2) * (ray_x**2 + ray_y**2 + 1.0))
     return 1.0 / length

@@ -9,11 +9,15 @@ crosses the camera's plane. The unit's own rasteriser works by another method, o
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geometry.kernels.bundles import plain
 from geometry.kernels.jit import kernel
+from geometry.kernels.pinhole import Camera
+from geometry.rendering.kernel_camera import camera_of
 from shared.camera import Intrinsics
 from shared.transforms import Transform, inverse
 from simulation.world.scene import Body, Scene, View
@@ -22,11 +26,28 @@ NEAR_M = 0.02
 """Nothing nearer is drawn: it would be inside the camera's housing."""
 
 
+class Picture(NamedTuple):
+    """What is drawn: inverse depth `w` (H, W) float32 of 1/m, nothing nearer than `near_m`, and its `owner` (H, W)."""
+
+    w: NDArray[np.float32]
+    owner: NDArray[np.uint8]
+    near_m: float
+
+
+class Segments(NamedTuple):
+    """Capsules: ends `a_m`, `b_m` (K, 3) in the camera frame, `radius_m` and `label` (K,)."""
+
+    a_m: NDArray[np.float64]
+    b_m: NDArray[np.float64]
+    radius_m: NDArray[np.float64]
+    label: NDArray[np.uint8]
+
+
 class RasterRenderer:
     """Draws scenes as seen by one camera; what is fixed is drawn once."""
 
     def __init__(self, intrinsics: Intrinsics, T_world_camera: Transform) -> None:
-        self._intrinsics = intrinsics
+        self._camera = camera_of(intrinsics)
         self._T_camera_world = inverse(T_world_camera)
         self._fixed: tuple[Body, ...] | None = None
         self._fixed_w = np.zeros(intrinsics.shape, dtype=np.float32)
@@ -45,27 +66,29 @@ class RasterRenderer:
         owner = self._fixed_owner.copy()
         for body in scene.moving:
             self._draw(body, w, owner)
-        camera, pose = self._intrinsics, self._T_camera_world
+        pose = self._T_camera_world
         capsules = scene.capsules
         if len(capsules):
             a_camera_m = capsules.a_m @ pose[:3, :3].T + pose[:3, 3]
             b_camera_m = capsules.b_m @ pose[:3, :3].T + pose[:3, 3]
-            draw_capsules(
-                a_camera_m, b_camera_m, capsules.radius_m, capsules.owner,
-                camera.fx, camera.fy, camera.cx, camera.cy, NEAR_M, w, owner,
-            )  # fmt: skip
+            segments = plain(Segments(a_camera_m, b_camera_m, capsules.radius_m, capsules.owner))
+            draw_capsules(segments, self._camera, plain(Picture(w, owner, NEAR_M)))
         to_depth(w)
         return View(w, owner)
 
     def _draw(self, body: Body, w: NDArray[np.float32], owner: NDArray[np.uint8]) -> None:
-        camera = self._intrinsics
         count = len(body.mesh.vertices)
         if count > len(self._corners):
             self._corners = np.empty((count, 3))
         draw_mesh(
-            body.mesh.vertices, body.mesh.faces, self._T_camera_world @ body.T_world_mesh, int(body.owner),
-            camera.fx, camera.fy, camera.cx, camera.cy, NEAR_M, self._corners, w, owner,
-        )  # fmt: skip
+            body.mesh.vertices,
+            body.mesh.faces,
+            self._T_camera_world @ body.T_world_mesh,
+            int(body.owner),
+            self._camera,
+            self._corners,
+            plain(Picture(w, owner, NEAR_M)),
+        )
 
 
 @kernel
@@ -74,20 +97,16 @@ def draw_mesh(
     faces: NDArray[np.int32],
     T_camera_mesh: NDArray[np.float64],
     label: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    near_m: float,
+    camera: Camera,
     corners: NDArray[np.float64],
-    w: NDArray[np.float32],
-    owner: NDArray[np.uint8],
+    picture: Picture,
 ) -> None:
-    """Draw a mesh, from both sides, into inverse depth `w` (H, W) float32 of 1/m and `owner` (H, W).
+    """Draw a mesh, from both sides.
 
     `vertices_m` (V, 3), `faces` (F, 3), `T_camera_mesh` (4, 4); `corners` (>= V, 3) is scratch.
     """
-    height, width = w.shape
+    fx, fy, cx, cy, width, height = Camera(*camera)
+    w, owner, near_m = Picture(*picture)
     t = T_camera_mesh
     for i in range(len(vertices_m)):
         px, py, pz = vertices_m[i, 0], vertices_m[i, 1], vertices_m[i, 2]
@@ -138,21 +157,11 @@ def draw_mesh(
 
 
 @kernel
-def draw_capsules(
-    a_camera_m: NDArray[np.float64],
-    b_camera_m: NDArray[np.float64],
-    radius_m: NDArray[np.float64],
-    label: NDArray[np.uint8],
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    near_m: float,
-    w: NDArray[np.float32],
-    owner: NDArray[np.uint8],
-) -> None:
-    """Draw capsules with ends `a_camera_m`, `b_camera_m` (K, 3) into inverse depth `w` and `owner` (H, W)."""
-    height, width = w.shape
+def draw_capsules(segments: Segments, camera: Camera, picture: Picture) -> None:
+    """Draw capsules."""
+    a_camera_m, b_camera_m, radius_m, label = Segments(*segments)
+    fx, fy, cx, cy, width, height = Camera(*camera)
+    w, owner, near_m = Picture(*picture)
     for i in range(len(radius_m)):
         ax, ay, az = a_camera_m[i, 0], a_camera_m[i, 1], a_camera_m[i, 2]
         bx, by, bz = b_camera_m[i, 0], b_camera_m[i, 1], b_camera_m[i, 2]

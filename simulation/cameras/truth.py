@@ -13,11 +13,15 @@ to `NOISE_SIGMAS` standard deviations of depth. A reported voxel is false when n
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geometry.kernels.bundles import plain
 from geometry.kernels.jit import kernel
+from geometry.kernels.pinhole import Camera
+from geometry.rendering.kernel_camera import camera_of
 from shared.camera import Intrinsics
 from shared.lattice import Lattice
 from shared.transforms import Transform, inverse
@@ -64,6 +68,25 @@ class FrameTruth:
         return self.visible_keys[~self.outside]
 
 
+class Grid(NamedTuple):
+    """The lattice: where it begins, (3,), its voxels' size and its shape (3,)."""
+
+    origin_m: NDArray[np.float64]
+    voxel_size_m: float
+    shape: NDArray[np.int64]
+
+
+class Found(NamedTuple):
+    """Keys of the voxels of all unknown pixels, of those outside the margin, and, each once, of those that such a
+    pixel's point may be measured in. `marked` (cells,) is scratch, all false before and after.
+    """
+
+    inside: NDArray[np.uint32]
+    beyond_margin: NDArray[np.uint32]
+    surface: NDArray[np.uint32]
+    marked: NDArray[np.bool_]
+
+
 class TruthFinder:
     """Finds the truth of one camera's frames on one lattice."""
 
@@ -86,14 +109,19 @@ class TruthFinder:
         `limit_m` (H, W) float32: a pixel is outside the margin when its true depth is below it (inf: nothing known
         there); None when all are.
         """
-        camera, lattice = self._intrinsics, self._lattice
+        lattice = self._lattice
         limits = np.full((1, 1), np.inf, dtype=np.float32) if limit_m is None else limit_m
         inside, beyond, surface = find_keys(
-            view.z_m, view.owner, int(FIRST_UNKNOWN), limits, self._tolerance_m,
-            camera.fx, camera.fy, camera.cx, camera.cy, self._T_world_camera,
-            np.array(lattice.origin_m), lattice.voxel_size_m, np.array(lattice.shape),
-            self._inside, self._beyond_margin, self._marked, self._surface,
-        )  # fmt: skip
+            view.z_m,
+            view.owner,
+            int(FIRST_UNKNOWN),
+            limits,
+            self._tolerance_m,
+            camera_of(self._intrinsics),
+            self._T_world_camera,
+            plain(Grid(np.array(lattice.origin_m), lattice.voxel_size_m, np.array(lattice.shape))),
+            plain(Found(self._inside, self._beyond_margin, self._surface, self._marked)),
+        )
         keys, counts = np.unique(self._inside[:inside], return_counts=True)
         outside_keys, outside_counts = np.unique(self._beyond_margin[:beyond], return_counts=True)
         enough = counts >= self._enough(keys)
@@ -148,25 +176,19 @@ def find_keys(
     first_unknown: int,
     limit_m: NDArray[np.float32],
     tolerance_m: NDArray[np.float64],
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
+    camera: Camera,
     T_world_camera: NDArray[np.float64],
-    origin_m: NDArray[np.float64],
-    voxel_size_m: float,
-    shape: NDArray[np.int64],
-    inside: NDArray[np.uint32],
-    beyond_margin: NDArray[np.uint32],
-    marked: NDArray[np.bool_],
-    surface: NDArray[np.uint32],
+    grid: Grid,
+    found: Found,
 ) -> tuple[int, int, int]:
-    """Keys of the voxels of all unknown pixels, of those nearer than `limit_m` ((H, W), or (1, 1) for all), and
-    each voxel once that such a pixel's point may be measured in. Returns how many of each.
+    """Find what the unknown pixels of a view may be reported as; returns how many keys of each kind are `found`.
 
-    `tolerance_m` over depth in steps of `SIGMA_STEP_M`. `marked` (cells,) is scratch, all false before and after.
+    Outside the margin is what is nearer than `limit_m` ((H, W), or (1, 1) for all). `tolerance_m` over depth in steps
+    of `SIGMA_STEP_M`.
     """
-    height, width = z_m.shape
+    fx, fy, cx, cy, width, height = Camera(*camera)
+    origin_m, voxel_size_m, shape = Grid(*grid)
+    inside, beyond_margin, surface, marked = Found(*found)
     t = T_world_camera
     scale = 1.0 / voxel_size_m
     last = len(tolerance_m) - 1

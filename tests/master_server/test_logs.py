@@ -45,7 +45,7 @@ def test_a_line_of_json_tells_who_and_what(configured: Configure) -> None:
     one = master()
     unit = joined(one)
     unit.update(START_NS + S, [1])
-    one.units(START_NS + 3 * S)
+    one.tick(START_NS + 3 * S)
     lines = parsed(written)
     assert [(line["event"], line.get("state")) for line in lines] == [
         ("pose", None), ("state", "live"), ("state", "stale"),
@@ -151,6 +151,6 @@ def test_a_unit_that_comes_and_goes_does_not_fill_the_disk(configured: Configure
     for step in range(100):
         now_ns = START_NS + S + step * S
         unit.update(now_ns)
-        one.units(now_ns + S // 2)
+        one.tick(now_ns + S // 2)
     states = [line for line in parsed(written) if line["event"] == "state"]
     assert len(states) == BURST

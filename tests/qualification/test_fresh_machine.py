@@ -20,13 +20,13 @@ from tests.missing import need_command
 CHECKOUT = Path(__file__).parents[2]
 
 REPORT = """<testsuites><testsuite tests="7">
-<testcase classname="tests.test_a" name="test_one" />
-<testcase classname="tests.test_a" name="test_two"><properties /></testcase>
-<testcase classname="tests.test_a" name="test_wrong"><failure message="no">text</failure></testcase>
-<testcase classname="tests.test_a" name="test_broken"><error message="no">text</error></testcase>
-<testcase classname="tests.test_a" name="test_seen[1]"><skipped message="no browser" /></testcase>
-<testcase classname="tests.test_a" name="test_seen[2]"><skipped message="no browser" /></testcase>
-<testcase classname="tests.test_a" name="test_booted"><skipped message="no machines" /></testcase>
+<testcase classname="some.test_a" name="test_one" />
+<testcase classname="some.test_a" name="test_two"><properties /></testcase>
+<testcase classname="some.test_a" name="test_wrong"><failure message="no">text</failure></testcase>
+<testcase classname="some.test_a" name="test_broken"><error message="no">text</error></testcase>
+<testcase classname="some.test_a" name="test_seen[1]"><skipped message="no browser" /></testcase>
+<testcase classname="some.test_a" name="test_seen[2]"><skipped message="no browser" /></testcase>
+<testcase classname="some.test_a" name="test_booted"><skipped message="no machines" /></testcase>
 </testsuite></testsuites>"""
 
 FIGURES: dict[str, Any] = {"failures": [], "fps_per_unit": [15.0, 14.9, 15.0, 14.8]}
@@ -40,7 +40,7 @@ def test_reports_are_counted_with_the_reasons_of_what_was_skipped(tmp_path: Path
         (tmp_path / name).write_text(REPORT)
     tests = counted(tmp_path, 2)
     assert (tests.passed, tests.failed, tests.skipped) == (4, 4, {"no browser": 4, "no machines": 2})
-    assert tests.names == ["tests.test_a::test_wrong", "tests.test_a::test_broken"] * 2
+    assert tests.names == ["some.test_a::test_wrong", "some.test_a::test_broken"] * 2
 
 
 @pytest.mark.parametrize("code", [2, None])

@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from edge_unit.pipeline import DepthPipeline, Misfit
 from edge_unit.pipeline.pose_misfit import STEPS, MisfitCheck
 from geometry.kernels import misfit
+from geometry.kernels.agreement import Tolerance
+from geometry.kernels.bundles import plain
+from geometry.rendering.kernel_camera import camera_of
 from shared.settings import FilterSettings
 from shared.transforms import Transform, from_xyz_rpy
 from tests.edge_unit.scenes import OVERHEAD, Depth, bodies, camera, measured, raycast, small_cell
@@ -15,7 +18,9 @@ from tests.edge_unit.scenes import OVERHEAD, Depth, bodies, camera, measured, ra
 CAMERA = camera(212, 120)
 NO_ROBOT = np.full(CAMERA.shape, 65535, np.uint16)
 FOCAL, CENTRE = (CAMERA.fx, CAMERA.fy), (CAMERA.cx, CAMERA.cy)
+LENS = camera_of(CAMERA)
 BASE, PER = 10.0, 2e-6
+SCALE, MARGIN = plain(Tolerance(BASE, PER)), plain(Tolerance(30.0, 1e-5))
 
 
 def points_of(
@@ -23,7 +28,7 @@ def points_of(
 ) -> tuple[NDArray[np.float32], list[int]]:
     points = np.full((3, depth.size), np.nan, np.float32)
     tallies = np.zeros(4, np.int64)
-    found = misfit.compared_points(depth, static, robot, FOCAL, CENTRE, stride, 30.0, 1e-5, points, tallies)
+    found = misfit.compared_points(depth, static, robot, LENS, MARGIN, stride, points, tallies)
     return points[:, :found], tallies.tolist()
 
 
@@ -74,7 +79,7 @@ def test_the_kernels_equal_their_slow_twins(kind: str, stride: int) -> None:
     assert tallies == slow_tallies
     np.testing.assert_allclose(points, slow, rtol=1e-6, atol=1e-3)
     for T in (np.eye(4), from_xyz_rpy((20.0, -35.0, 15.0), (0.01, -0.02, 0.03)), from_xyz_rpy((0, 0, 0), (0, 3.0, 0))):
-        fast = misfit.misfit_there(points, points.shape[1], static, FOCAL, CENTRE, T, BASE, PER)
+        fast = misfit.misfit_there(points, points.shape[1], static, LENS, T, SCALE)
         # A point that falls upon the border of two pixels may fall to either side in float32.
         assert fast == pytest.approx(slow_misfit(slow, static, T), abs=2e-3 * max(points.shape[1], 1) + 1e-6)
 

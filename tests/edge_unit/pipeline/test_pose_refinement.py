@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from edge_unit.pipeline import DepthPipeline, Refiner
 from edge_unit.pipeline.pose_refinement import FAR_M, median_depth_m, planes_of
 from geometry.kernels import align
+from geometry.kernels.bundles import plain
+from geometry.rendering.kernel_camera import camera_of
 from shared.errors import InputError
 from shared.transforms import Transform, from_xyz_rpy, inverse
 from simulation.cameras.camera import SimulatedCamera, d435i_intrinsics, rig
@@ -18,6 +20,7 @@ from tests.edge_unit.scenes import OVERHEAD, Depth, bodies, camera, demo_cell, m
 
 EYE = camera(212, 120)
 FOCAL, CENTRE = (EYE.fx, EYE.fy), (EYE.cx, EYE.cy)
+LENS = camera_of(EYE)
 NUDGE = from_xyz_rpy((0.01, -0.02, 0.015), (0.01, -0.02, 0.015))
 
 
@@ -74,9 +77,10 @@ def test_the_kernels_equal_their_slow_twins(kind: str) -> None:
     points, scale = np.ascontiguousarray(points), np.full(points.shape[1], 0.05, np.float32)
     oblique, normals = planes_of(expected, EYE)
     distances = np.empty(points.shape[1], np.float32)
-    cost = align.plane_cost(points, expected, oblique, FOCAL, CENTRE, NUDGE, scale, distances)
+    seen, measured_points = plain(align.Planes(expected, oblique, normals)), plain(align.Measured(points, scale))
+    cost = align.plane_cost(measured_points, seen, LENS, NUDGE, distances)
     information, gradient = np.empty((6, 6)), np.empty(6)
-    align.normal_equations(points, expected, normals, FOCAL, CENTRE, NUDGE, scale, information, gradient)
+    align.normal_equations(measured_points, seen, LENS, NUDGE, information, gradient)
     slow_cost, slow_distances, slow_information, slow_gradient = slow(points, expected, NUDGE, scale)
     # A point on the border of two pixels may fall to either side in float32.
     assert cost == pytest.approx(slow_cost, abs=2.0)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from geometry.kernels.agreement import RESIDUAL_BINS, compare
+from geometry.kernels.agreement import RESIDUAL_BINS, Tolerance, compare
+from geometry.kernels.bundles import plain
 
 BASE_RAW, PER_RAW2 = 40.0, 1e-5
 
@@ -14,7 +15,7 @@ def run(
     depth: NDArray[np.uint16], static: NDArray[np.uint16], robot: NDArray[np.uint16], stride_px: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     bins, tallies = np.full(RESIDUAL_BINS, 7, np.int64), np.full(4, 7, np.int64)
-    compare(depth, static, robot, BASE_RAW, PER_RAW2, stride_px, bins, tallies)
+    compare(depth, static, robot, plain(Tolerance(BASE_RAW, PER_RAW2)), stride_px, bins, tallies)
     return bins, tallies
 
 

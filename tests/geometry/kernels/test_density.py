@@ -8,8 +8,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from geometry.kernels.bundles import plain
 from geometry.kernels.density import (
     AT_ONCE,
+    Kept,
+    Rule,
+    View,
     expected_angular,
     expected_pinhole,
     keep_dense,
@@ -21,6 +25,22 @@ from shared.transforms import Transform, apply, from_xyz_rpy, inverse
 
 FX, FY = 320.0, 310.0
 DEGREES_PER_COLUMN, DEGREES_PER_ROW = 69.0 / 424.0, 42.0 / 240.0
+
+
+def view_of(lattice: Lattice, T_world_camera: Transform) -> View:
+    T_camera_world = inverse(T_world_camera)
+    return plain(
+        View(
+            np.array(lattice.shape, np.int32),
+            lattice.voxel_size_m,
+            apply(T_camera_world, lattice.centres(np.zeros(3))),
+            np.ascontiguousarray(T_camera_world[:3, :3] * lattice.voxel_size_m),
+            FX,
+            FY,
+            DEGREES_PER_COLUMN,
+            DEGREES_PER_ROW,
+        )
+    )
 
 
 def kept(
@@ -39,29 +59,13 @@ def kept(
     # One more for what lies outside the lattice; its points count for nothing.
     memory = np.append(rimmed.ravel(), np.uint32(10**6)).astype(np.uint32)
     keys, kept_counts = (np.full(len(slots) + 1, 0xFFFFFFFF, np.uint32) for _ in range(2))
-    T_camera_world = inverse(T_world_camera)
     number = keep_dense(
         memory,
         slots,
         len(slots),
-        np.array(lattice.shape, np.int32),
-        lattice.voxel_size_m,
-        apply(T_camera_world, lattice.centres(np.zeros(3))),
-        np.ascontiguousarray(T_camera_world[:3, :3] * lattice.voxel_size_m),
-        FX,
-        FY,
-        DEGREES_PER_COLUMN,
-        DEGREES_PER_ROW,
-        angular,
-        single,
-        threshold,
-        own_share_min,
-        area_max_m2,
-        points_min,
-        np.empty((6, AT_ONCE)),
-        np.empty(AT_ONCE, np.uint32),
-        keys,
-        kept_counts,
+        view_of(lattice, T_world_camera),
+        plain(Rule(angular, single, threshold, own_share_min, area_max_m2, points_min)),
+        plain(Kept(keys, kept_counts, np.empty((6, AT_ONCE)), np.empty(AT_ONCE, np.uint32))),
     )
     assert (np.diff(keys[:number].astype(np.int64)) > 0).all(), "in the order of the slots"
     assert (kept_counts[:number] == counts.ravel()[keys[:number]]).all()
@@ -146,7 +150,8 @@ def test_slots_of_the_largest_lattices_are_located_exactly(shape: tuple[int, int
     slots = ((index[:, 0] + 1) * (ny + 2) + index[:, 1] + 1) * (nz + 2) + index[:, 2] + 1
     keys, z_m, distance_m = np.empty(3000, np.uint32), np.empty(3000), np.empty(3000)
     first_m, axes = np.array((0.1, -0.2, 0.3)), rng.normal(0.0, 0.01, (3, 3))
-    locate(slots.astype(np.uint32), np.array(shape, np.int32), first_m, axes, keys, z_m, distance_m)
+    view = plain(View(np.array(shape, np.int32), 0.01, first_m, axes, FX, FY, DEGREES_PER_COLUMN, DEGREES_PER_ROW))
+    locate(slots.astype(np.uint32), view, keys, z_m, distance_m)
     assert (keys == (index[:, 0] * ny + index[:, 1]) * nz + index[:, 2]).all()
     centres_m = first_m + index @ axes.T
     assert np.allclose(z_m, centres_m[:, 2])

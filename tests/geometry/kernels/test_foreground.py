@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from geometry.kernels.bundles import plain
 from geometry.kernels.foreground import foreground_mask
+from geometry.kernels.limits import Band
 
 RAW_MAX = 65535
 EDGES = np.array([0, 1, 2, 149, 150, 151, 999, 1000, 1001, 32767, 32768, 65534, 65535], np.uint16)
@@ -41,7 +43,7 @@ def run(
     mask = np.full((height, -(-width // 8) * 8), 9, np.uint8)
     mask[:, width:] = 0
     room = (np.maximum(limit.astype(np.int64), minimum) - minimum).astype(np.uint16)
-    foreground_mask(depth, room, near, span, robot_columns, minimum, mask)
+    foreground_mask(depth, room, minimum, plain(Band(near, span, robot_columns)), mask)
     assert (mask[:, width:] == 0).all()
     assert (mask <= 1).all()
     return mask[:, :width].astype(np.bool_)

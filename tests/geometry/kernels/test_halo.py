@@ -5,21 +5,24 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from geometry.kernels.halo import drop_halo, halo_bands, spread_edges
+from geometry.kernels.bundles import plain
+from geometry.kernels.halo import Halo, Margin, drop_halo, halo_bands, spread_edges
+from geometry.kernels.pinhole import Camera
 
 SHAPE = (31, 47)
 FX, FY = 60.0, 70.0
 BASE_M, NOISE_PER_M, SCALE_M = 0.03, 0.02, 0.001
 RAW_MAX = 65535
+MARGIN, CAMERA = plain(Margin(BASE_M, NOISE_PER_M)), plain(Camera(FX, FY, 23.0, 15.0, SHAPE[1], SHAPE[0]))
 
 
 def bands(w: NDArray[np.float32], padding_m: float) -> tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.uint16]]:
     nearest_w, farthest_w = np.full((2, *w.shape), 7.0, np.float32)
-    number = spread_edges(w, padding_m, BASE_M, NOISE_PER_M, FX, FY, nearest_w, farthest_w)
+    number = spread_edges(w, padding_m, MARGIN, CAMERA, nearest_w, farthest_w)
     assert number == np.count_nonzero(nearest_w)
     pixels = np.empty(number, np.int32)
     near_raw, span_raw = np.empty((2, number), np.uint16)
-    halo_bands(nearest_w, farthest_w, BASE_M, NOISE_PER_M, SCALE_M, pixels, near_raw, span_raw)
+    halo_bands(nearest_w, farthest_w, MARGIN, SCALE_M, pixels, near_raw, span_raw)
     return pixels, near_raw, span_raw
 
 
@@ -104,5 +107,5 @@ def test_only_what_lies_in_the_band_is_dropped() -> None:
     for top in (0, 40):
         runs = np.array([[top, 0, 0, 3], [top, 3, 3, 7]], np.int32)
         found = mask.copy()
-        drop_halo(depth, top, runs, np.full(7, 950, np.uint16), np.full(7, 100, np.uint16), found)
+        drop_halo(depth, top, plain(Halo(runs, np.full(7, 950, np.uint16), np.full(7, 100, np.uint16))), found)
         assert found[0].tolist() == [1, 1, 0, 0, 0, 1, 1, 0] + [1] * 8

@@ -8,8 +8,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from geometry.kernels import limits
+from geometry.kernels.bundles import plain
 from geometry.kernels.limits import RAW_MAX, clear_band, lower_depth, nearest_over, robot_band_raw, static_limit_raw
-from geometry.kernels.rasterize import LANES, NOTHING_FARTHEST, NOTHING_NEAREST
+from geometry.kernels.rasterize import LANES, NOTHING_FARTHEST, NOTHING_NEAREST, Buffer
 
 SHAPE = (37, 61)
 
@@ -35,9 +37,9 @@ def static_twin(
     return np.clip(limit_m / scale_m, 0.0, RAW_MAX)
 
 
-def static_limit(*arguments: Any) -> NDArray[np.uint16]:
-    out = np.full(np.shape(arguments[0]), 123, np.uint16)
-    static_limit_raw(*arguments, out)
+def static_limit(w: Any, reference_m: Any, spread_m: Any, *figures: float) -> NDArray[np.uint16]:
+    out = np.full(np.shape(w), 123, np.uint16)
+    static_limit_raw(w, reference_m, spread_m, plain(limits.Margins(*figures)), out)
     return out
 
 
@@ -153,6 +155,7 @@ class Band:
     def __init__(self) -> None:
         self.near_raw, self.span_raw = np.full(SHAPE, RAW_MAX, np.uint16), np.zeros(SHAPE, np.uint16)
         self.columns = np.zeros((SHAPE[0], 2), np.int32)
+        self.bundle = plain(limits.Band(self.near_raw, self.span_raw, self.columns))
 
     def draw(self, rng: np.random.Generator, rectangles: NDArray[np.int32], scale_m: float) -> None:
         """Draw what is random, and compare all images with the twin's."""
@@ -168,10 +171,8 @@ class Band:
         window, nearest = windowed(nearest_w, rectangles)
         _, farthest = windowed(farthest_w, rectangles)
         links = np.ones(len(rectangles), np.bool_)
-        robot_band_raw(
-            window, nearest, farthest, rectangles, links, 0.02, 0.15, scale_m,
-            self.near_raw, self.span_raw, self.columns,
-        )  # fmt: skip
+        buffer = plain(Buffer(window, nearest, farthest))
+        robot_band_raw(buffer, rectangles, links, 0.02, 0.15, scale_m, self.bundle)
         low, high = band_twin(nearest_w, farthest_w, 0.02, 0.15, scale_m)
         near, end = self.near_raw.astype(np.float64), self.near_raw.astype(np.float64) + self.span_raw
         slack = 1.0 + 1e-6 * RAW_MAX
@@ -202,7 +203,7 @@ def test_a_band_is_cleared_wherever_it_is() -> None:
     band = Band()
     band.draw(np.random.default_rng(0), RECTANGLES, 0.001)
     assert (band.near_raw < RAW_MAX).any()
-    clear_band(band.near_raw, band.span_raw, band.columns)
+    clear_band(band.bundle)
     assert (band.near_raw == RAW_MAX).all()
     assert not band.span_raw.any()
     assert not band.columns.any()
@@ -216,9 +217,9 @@ def test_lower_depth_takes_the_nearer() -> None:
     before_m = np.where(rng.random(SHAPE) < 0.5, rng.uniform(0.5, 3.0, SHAPE), np.inf).astype(np.float32)
     depth_m = before_m.copy()
     window, nearest = windowed((1.0 / z_m).astype(np.float32), RECTANGLES)
-    lower_depth(window, nearest, RECTANGLES, np.ones(4, np.bool_), depth_m)
+    lower_depth(plain(Buffer(window, nearest, nearest)), RECTANGLES, np.ones(4, np.bool_), depth_m)
     assert np.allclose(depth_m, np.minimum(before_m, z_m))
-    lower_depth(np.zeros(4, np.int64), nearest, RECTANGLES[3:], np.ones(1, np.bool_), depth_m)
+    lower_depth(plain(Buffer(np.zeros(4, np.int64), nearest, nearest)), RECTANGLES[3:], np.ones(1, np.bool_), depth_m)
 
 
 def test_robot_band_of_a_surface_at_the_camera_starts_at_0() -> None:
@@ -227,6 +228,7 @@ def test_robot_band_of_a_surface_at_the_camera_starts_at_0() -> None:
     near_raw, span_raw = np.zeros((1, 1), np.uint16), np.zeros((1, 1), np.uint16)
     window, rectangles = np.array((0, 0, 1, 1)), np.array([[0, 0, 0, 0]], np.int32)
     columns = np.zeros((1, 2), np.int32)
-    robot_band_raw(window, w, w, rectangles, one, 50.0, 0.15, 0.001, near_raw, span_raw, columns)
+    band = plain(limits.Band(near_raw, span_raw, columns))
+    robot_band_raw(plain(Buffer(window, w, w)), rectangles, one, 50.0, 0.15, 0.001, band)
     assert near_raw[0, 0] == 0
     assert span_raw[0, 0] == pytest.approx(200 + 2000, abs=1)

@@ -6,12 +6,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geometry.kernels.pinhole import deproject, moved, nearest_pixel, project, rows_of, rows_of_32
+from geometry.kernels.pinhole import Camera, deproject, in_32, moved, nearest_pixel, project, rows_of, rows_of_32
 from shared.camera import Intrinsics
 from shared.transforms import apply, from_xyz_rpy
 
 CAMERA = Intrinsics(61, 43, 50.0, 52.0, 29.7, 21.2)
-LENS = CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy
+LENS = Camera(CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, CAMERA.width, CAMERA.height)
 T = from_xyz_rpy((0.3, -0.2, 0.7), (0.4, -1.1, 2.5))
 POINTS_M = np.random.default_rng(0).uniform((-1.0, -1.0, 0.2), (1.0, 1.0, 3.0), (200, 3))
 
@@ -26,20 +26,20 @@ def test_in_float32_they_stay_in_float32() -> None:
     there_m = np.array([moved(rows_of_32(T), *point) for point in points_m])
     np.testing.assert_allclose(there_m, apply(T, points_m.astype(np.float64)), atol=1e-6)
     x, y, z = points_m[0]
-    lens = [np.float32(each) for each in LENS]
-    for found, exact in zip(project(x, y, np.float32(1.0) / z, *lens), CAMERA.project(POINTS_M[:1])[0], strict=True):
-        assert found == pytest.approx(exact, abs=1e-4)
+    found = project(x, y, np.float32(1.0) / z, in_32(LENS))
+    for place, exact in zip(found, CAMERA.project(POINTS_M[:1])[0], strict=True):
+        assert place == pytest.approx(exact, abs=1e-4)
 
 
 def test_a_point_lies_where_the_camera_has_it_and_comes_back() -> None:
-    pixels = np.array([project(x, y, 1.0 / z, *LENS) for x, y, z in POINTS_M])
+    pixels = np.array([project(x, y, 1.0 / z, LENS) for x, y, z in POINTS_M])
     np.testing.assert_allclose(pixels, CAMERA.project(POINTS_M), atol=1e-9)
-    back_m = np.array([deproject(u, v, z, *LENS) for (u, v), z in zip(pixels, POINTS_M[:, 2], strict=True)])
+    back_m = np.array([deproject(u, v, z, LENS) for (u, v), z in zip(pixels, POINTS_M[:, 2], strict=True)])
     np.testing.assert_allclose(back_m, POINTS_M, atol=1e-12)
 
 
 def test_pixel_centres_are_at_integers() -> None:
-    assert project(0.0, 0.0, 1.0, *LENS) == (CAMERA.cx, CAMERA.cy)
+    assert project(0.0, 0.0, 1.0, LENS) == (CAMERA.cx, CAMERA.cy)
     for pixel in (-3, 0, 7):
         assert [nearest_pixel(pixel + part) for part in (-0.51, -0.5, -0.49, 0.0, 0.49, 0.5)] == [
             pixel - 1, pixel, pixel, pixel, pixel, pixel + 1,

@@ -6,10 +6,12 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_unit.pipeline.edge_halo import runs_of
+from geometry.kernels.bundles import plain
 from geometry.kernels.foreground import foreground_mask
-from geometry.kernels.halo import drop_halo
+from geometry.kernels.halo import Halo, drop_halo
+from geometry.kernels.limits import Band
 from geometry.kernels.points import ROWS_AT_ONCE, count_foreground
-from geometry.kernels.voxelize import count_points
+from geometry.kernels.voxelize import Counter, Grid, Mask, count_points
 
 SHAPE = (9, 8, 7)
 
@@ -37,17 +39,18 @@ def test_a_few_rows_at_a_time_are_the_whole_image_at_once(height: int, width: in
 
     mask = np.zeros((height, stride), np.uint8)
     counts, touched = np.zeros(size, np.uint32), np.zeros(size, np.uint32)
-    foreground_mask(depth, room, near, span, columns, 1, mask)
-    drop_halo(depth, 0, runs, halo_near, halo_span, mask)
-    slots = np.empty(width, np.int32)
-    found = count_points(depth, mask.view(np.uint64), mask, *rays, *lattice, slots, counts, touched, 0)
+    robot, halo = plain(Band(near, span, columns)), plain(Halo(runs, halo_near, halo_span))
+    grid, slots = plain(Grid(*rays, *lattice)), np.empty(width, np.int32)
+    foreground_mask(depth, room, 1, robot, mask)
+    drop_halo(depth, 0, halo, mask)
+    marked, counter = plain(Mask(mask.view(np.uint64), mask)), plain(Counter(counts, touched, slots))
+    found = count_points(depth, marked, grid, counter, 0)
 
     rows = np.zeros((ROWS_AT_ONCE, stride), np.uint8)
     again, touched_again = np.zeros(size, np.uint32), np.zeros(size, np.uint32)
-    found_again = count_foreground(
-        depth, room, near, span, columns, 1, runs, halo_near, halo_span, *rays, *lattice,
-        rows.view(np.uint64), rows, slots, again, touched_again,
-    )  # fmt: skip
+    scratch = plain(Mask(rows.view(np.uint64), rows))
+    counter_again = plain(Counter(again, touched_again, slots))
+    found_again = count_foreground(depth, room, 1, robot, halo, grid, scratch, counter_again)
     assert found_again == found > 0
     assert (again[:-1] == counts[:-1]).all()
     assert (touched_again == touched).all()

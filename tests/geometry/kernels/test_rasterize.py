@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from geometry.kernels.rasterize import LANES, NOTHING_FARTHEST, NOTHING_NEAREST, SMALL_ROWS, draw_meshes, span_of_row
+from geometry.kernels.bundles import plain
+from geometry.kernels.project import Meshes, Scratch
+from geometry.kernels.project import Screen as Projection
+from geometry.kernels.rasterize import (
+    LANES,
+    NOTHING_FARTHEST,
+    NOTHING_NEAREST,
+    SMALL_ROWS,
+    Buffer,
+    draw_meshes,
+    span_of_row,
+)
 from shared.meshes import TriangleMesh, box_mesh, sphere_mesh
 from shared.transforms import Transform, apply, from_xyz_rpy, look_at
 
@@ -64,33 +75,37 @@ class Screen:
         mine = np.ones(len(meshes), np.bool_) if chosen is None else np.array(chosen)
         kept = self.buffer if over is None else over.buffer
         self.shown = mine if over is None else np.ones(len(meshes), np.bool_)
+        farthest_w = [buffer.memory[1] if farthest else nothing[:, 0] for buffer in (kept, self.buffer)]
+        camera = (np.float32(each) for each in (self.f_px, self.f_px, self.cx, self.cy, NEAR_M))
         draw_meshes(
-            np.concatenate([*vertices, nothing]).T.copy(),
-            np.concatenate([*offsets, nothing]).T.copy(),
-            np.concatenate(faces).T.copy(),
-            np.cumsum([0, *(len(points) for points in vertices)]).astype(np.int32),
-            np.cumsum([0, *(len(mesh.faces) for mesh in meshes)]).astype(np.int32),
-            np.array([mesh.closed for mesh in meshes], np.bool_),
+            plain(
+                Meshes(
+                    np.concatenate([*vertices, nothing]).T.copy(),
+                    np.concatenate([*offsets, nothing]).T.copy(),
+                    np.concatenate(faces).T.copy(),
+                    np.cumsum([0, *(len(points) for points in vertices)]).astype(np.int32),
+                    np.cumsum([0, *(len(mesh.faces) for mesh in meshes)]).astype(np.int32),
+                    np.array([mesh.closed for mesh in meshes], np.bool_),
+                )
+            ),
             mine,
             np.zeros_like(mine) if over is None else ~mine,
             np.array(T_camera_mesh, np.float64).reshape(-1, 4, 4),
             np.full(len(meshes), padding_m, np.float32),
-            np.array((self.f_px, self.f_px, self.cx, self.cy, NEAR_M), np.float32),
-            self.width,
-            self.height,
-            np.empty((6, sum(map(len, vertices))), np.float32),
-            np.empty(len(meshes), np.int32),
-            np.empty(most_faces, np.uint8),
-            np.empty((3, most_faces + 1), np.int32),
-            np.empty((3, 3), np.float32),
-            np.empty((4, 3), np.float64),
-            kept.window,
-            kept.memory[0],
-            kept.memory[1] if farthest else nothing[:, 0],
-            self.buffer.window,
-            self.buffer.memory[0],
-            self.buffer.memory[1] if farthest else nothing[:, 0],
+            plain(Projection(*camera, self.width, self.height)),
+            plain(Buffer(kept.window, kept.memory[0], farthest_w[0])),
+            plain(Buffer(self.buffer.window, self.buffer.memory[0], farthest_w[1])),
             self.rectangles,
+            plain(
+                Scratch(
+                    np.empty((6, sum(map(len, vertices))), np.float32),
+                    np.empty(len(meshes), np.int32),
+                    np.empty(most_faces, np.uint8),
+                    np.empty((3, most_faces + 1), np.int32),
+                    np.empty((3, 3), np.float32),
+                    np.empty((4, 3), np.float64),
+                )
+            ),
         )
         self.buffer.check()
         return self

@@ -8,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from geometry.kernels.reference import MODES, conclude, observe, students_excess
+from geometry.kernels.bundles import plain
+from geometry.kernels.reference import MODES, Matching, Modes, Prior, conclude, observe, students_excess
 
 RAW_MAX = 65535
 SCALE_M, RANGE_MAX_M, BASE_M, NOISE_PER_M = 0.001, 6.0, 0.03, 0.02
@@ -25,17 +26,16 @@ class Learner:
         self.numbers = np.zeros((*shape, MODES), np.uint16)
         self.means_m = np.zeros((*shape, MODES), np.float32)
         self.squares_m2 = np.zeros((*shape, MODES), np.float32)
+        self.modes = plain(Modes(self.looks, self.numbers, self.means_m, self.squares_m2))
 
     def add(self, depth: Image, near: Image | None = None, span: Image | None = None) -> None:
         near = np.full(self.shape, RAW_MAX, np.uint16) if near is None else near
         span = np.zeros(self.shape, np.uint16) if span is None else span
-        figures = (SCALE_M, RANGE_MAX_M, BASE_M, NOISE_PER_M)
-        observe(depth, near, span, *figures, self.looks, self.numbers, self.means_m, self.squares_m2)
+        observe(depth, near, span, plain(Matching(SCALE_M, RANGE_MAX_M, BASE_M, NOISE_PER_M)), self.modes)
 
     def conclude(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         out = np.full(self.shape, 7, np.float32), np.full(self.shape, 7, np.float32)
-        figures = (SHARE_MIN, PRIOR_WEIGHT, PRIOR_NOISE_PER_M)
-        conclude(self.looks, self.numbers, self.means_m, self.squares_m2, *figures, *out)
+        conclude(self.modes, plain(Prior(SHARE_MIN, PRIOR_WEIGHT, PRIOR_NOISE_PER_M)), *out)
         return out
 
 

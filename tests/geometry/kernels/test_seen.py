@@ -7,7 +7,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from geometry.kernels.seen import BLOCKED_MAX, RAYS_PER_SIDE, block_views, seen_blocks
+from geometry.kernels.bundles import plain
+from geometry.kernels.seen import (
+    BLOCKED_MAX,
+    RAYS_PER_SIDE,
+    Blocks,
+    Looking,
+    Measuring,
+    Views,
+    block_views,
+    seen_blocks,
+)
+from geometry.rendering.kernel_camera import camera_of
 from shared.camera import Intrinsics
 from shared.lattice import Lattice
 from shared.transforms import Transform, apply, from_xyz_rpy, inverse, look_at
@@ -25,21 +36,11 @@ def views(
     blocks = np.full(lattice.cell_count, -1, np.int32)
     rectangles = np.full((lattice.cell_count, 5), -1, np.int32)
     number = block_views(
-        np.array(lattice.shape, np.int32),
-        lattice.voxel_size_m,
+        plain(Blocks(np.array(lattice.shape, np.int32), lattice.voxel_size_m, np.array(lattice.origin_m))),
         inverse(T_world_camera),
-        np.array(lattice.origin_m),
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
-        camera.width,
-        camera.height,
-        NEAR_M,
-        NOISE_PER_M,
-        camera.depth_scale_m,
-        blocks,
-        rectangles,
+        camera_of(camera),
+        plain(Measuring(NEAR_M, NOISE_PER_M, camera.depth_scale_m)),
+        plain(Views(blocks, rectangles)),
     )
     return number, blocks, rectangles
 
@@ -78,7 +79,7 @@ def test_no_block_in_view() -> None:
     seen = np.full(LATTICE.cell_count, 7, np.uint8)
     image = np.full(CAMERA.shape, 65535, np.uint16)
     nothing = views(LATTICE, away)
-    seen_blocks(image, image, image, nothing[1], nothing[2], 0, 0.9, 1, np.empty_like(image), seen)
+    seen_blocks(image, image, image, plain(Views(*nothing[1:])), 0, 0.9, plain(Looking(1, np.empty_like(image))), seen)
     assert not seen.any()
 
 
@@ -95,7 +96,9 @@ def look(
     number, blocks, rectangles = views(LATTICE, ABOVE)
     seen = np.full(LATTICE.cell_count, 7, np.uint8)
     reach = np.empty((-(-len(depth) // apart), depth.shape[1]), np.uint16)
-    seen_blocks(depth, limit, robot, blocks, rectangles, number, share, apart, reach, seen)
+    seen_blocks(
+        depth, limit, robot, plain(Views(blocks, rectangles)), number, share, plain(Looking(apart, reach)), seen
+    )
     return seen
 
 

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from geometry.kernels.voxelize import count_points, forget
+from geometry.kernels.bundles import plain
+from geometry.kernels.voxelize import Counter as Slots
+from geometry.kernels.voxelize import Grid, Mask, count_points, forget
 
 DOUBT_VOXELS = 1e-3
 """The kernel works in float32: this close to a border it may decide either way."""
@@ -40,15 +42,9 @@ class Counter:
         padded[:, :width] = mask
         self.found = count_points(
             depth,
-            padded.view(np.uint64),
-            padded,
-            np.ascontiguousarray(column_rays.T),
-            row_rays,
-            origin,
-            np.array(self.shape, np.int32),
-            np.empty(width, np.int32),
-            self.counts,
-            self.touched,
+            plain(Mask(padded.view(np.uint64), padded)),
+            plain(Grid(np.ascontiguousarray(column_rays.T), row_rays, origin, np.array(self.shape, np.int32))),
+            plain(Slots(self.counts, self.touched, np.empty(width, np.int32))),
             0,
         )
         assert not self.guard.any()

@@ -25,6 +25,7 @@ from zeroconf import IPVersion, ServiceStateChange, Zeroconf
 from zeroconf.asyncio import AsyncServiceBrowser, AsyncServiceInfo, AsyncZeroconf
 
 from shared.errors import WireError
+from shared.messages import CONTRACT_MINOR
 from shared.waiting import within
 
 logger = logging.getLogger(__name__)
@@ -82,6 +83,7 @@ class Announcement:
     contract: int
     tls: bool = False
     fingerprint: str = ""
+    minor: int = CONTRACT_MINOR
 
     def properties(self) -> dict[str, str]:
         """As it travels, each value bounded."""
@@ -89,6 +91,7 @@ class Announcement:
             "cell": shortened(self.cell),
             "sha256": self.cell_sha256[:SHA_DIGITS],
             "contract": str(self.contract),
+            "minor": str(self.minor),
             "tls": "yes" if self.tls else "no",
             "fingerprint": self.fingerprint[:SHA_DIGITS],
         }
@@ -118,7 +121,7 @@ def offer_of(name: str, port: int | None, addresses: Sequence[str], properties: 
     """
     values = {
         key: (properties.get(key.encode()) or b"")[: MAX_TXT_BYTES + 1].decode("utf-8", "replace")
-        for key in ("cell", "sha256", "contract", "tls", "fingerprint")
+        for key in ("cell", "sha256", "contract", "minor", "tls", "fingerprint")
     }
     label = name.removesuffix(f".{SERVICE_TYPE}")
     if not port or not 0 < port < 65536 or not addresses:
@@ -126,8 +129,9 @@ def offer_of(name: str, port: int | None, addresses: Sequence[str], properties: 
     for key, text in (("name", label), *values.items()):
         if not text.isprintable() or len(text.encode()) > MAX_TXT_BYTES:
             raise WireError(f"announcement {label!r:.80}: {key}: expected {MAX_TXT_BYTES} printable bytes at most")
-    contract = values["contract"]
-    if not (contract.isascii() and contract.isdigit() and len(contract) < 9) or not values["cell"]:
+    # Masters of contract 5.0 told no minor.
+    contract, minor = values["contract"], values["minor"] or "0"
+    if not (_is_number(contract) and _is_number(minor)) or not values["cell"]:
         raise WireError(f"announcement {label!r:.80}: expected a cell and a contract version")
     says = Announcement(
         values["cell"],
@@ -135,8 +139,13 @@ def offer_of(name: str, port: int | None, addresses: Sequence[str], properties: 
         int(contract),
         values["tls"] == "yes",
         values["fingerprint"][:SHA_DIGITS].lower(),
+        int(minor),
     )
     return Offer(label, says, tuple(addresses[:MAX_ADDRESSES]), port)
+
+
+def _is_number(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) < 9
 
 
 def shortened(text: str, max_bytes: int = MAX_TXT_BYTES) -> str:

@@ -11,6 +11,7 @@
         SourceEnded         ... because it has come to its end
       BoardError            the calibration board, as it is seen, does not tell the camera's pose
       WireError             bytes from the network are no message of ours
+        NewerContract       ... but one of a newer master, which this unit does not understand
       UplinkError           the exchange between unit and master failed
         MasterUnreachable   ... nobody answered
         MasterRefused       ... the master answered, and said no
@@ -64,6 +65,15 @@ class WireError(CellwatchError):
     """Bytes from the network are malformed, too long, or of another contract version."""
 
 
+class NewerContract(WireError):
+    """A master of a newer minor answered a registration with what this unit does not know."""
+
+    def __init__(self, message: str, answer: bytes) -> None:
+        """`answer` is what it said; a part of it every minor can read."""
+        super().__init__(message)
+        self.answer = answer
+
+
 class UplinkError(CellwatchError):
     """An exchange between a unit and the master failed."""
 
@@ -75,9 +85,11 @@ class MasterUnreachable(UplinkError):
 class MasterRefused(UplinkError):
     """The master answered with a refusal."""
 
-    def __init__(self, message: str, status: int) -> None:
+    def __init__(self, message: str, status: int, detail: str = "") -> None:
+        """`detail` is the sentence of the master alone."""
         super().__init__(message)
         self.status = status
+        self.detail = detail
 
 
 class Refusal(CellwatchError):

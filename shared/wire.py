@@ -9,7 +9,7 @@ The body of `/update` is a msgpack map of the fields of `UpdateRequest` that are
     versions                            array of 4 small integers, 5 to 13 bytes
     keys                                binary, 4 bytes a voxel: ascending little-endian uint32
     seen                                map, only when it changed: at most 4 kB (see `pack_seen`)
-    health                              array of 10 values, some 50 bytes
+    health                              array of 10 values and those of newer minors, some 50 bytes
     phase                               text, only while the unit is not live
 
 and its answer those of `UpdateAnswer`, where each joint sample is `[at_ns, positions, velocities]`
@@ -39,6 +39,7 @@ from shared.messages import (
     MAX_VOXELS,
     Health,
     JointSample,
+    Progress,
     SeenReport,
     UpdateAnswer,
     UpdateRequest,
@@ -63,6 +64,9 @@ MAX_SEEN_BLOCKS = 2**22
 
 ROWS: dict[str, type[BaseModel]] = {"versions": Versions, "health": Health}
 """Fields of an update and its answer that travel as the bare values of their own fields, in order."""
+
+LEAST = {"versions": 4, "health": 10}
+"""Values of such a row that every unit sends: as many as contract 5.0 had."""
 
 _VALUES = {name: attrgetter(*model.model_fields) for name, model in ROWS.items()}
 
@@ -108,6 +112,10 @@ def encode_update(update: UpdateRequest) -> bytes:
     fields = update.model_dump(exclude_defaults=True)
     for name in fields.keys() & ROWS:
         fields[name] = _VALUES[name](getattr(update, name))
+    if update.health.progress is not None:
+        fields["health"] = tuple(
+            tuple(value.model_dump().values()) if isinstance(value, Progress) else value for value in fields["health"]
+        )
     packed: bytes = msgpack.packb(fields)
     return packed
 
@@ -118,7 +126,7 @@ def decode_update(data: bytes) -> UpdateRequest:
     Raises:
         WireError: as in `decode`.
     """
-    return _validated(UpdateRequest, _named(_with_rows(unpack(data, MAX_UPDATE_BYTES))))
+    return _validated(UpdateRequest, _named(_with_rows(unpack(data, MAX_UPDATE_BYTES)), of_newer=False))
 
 
 def encode_update_answer(answer: UpdateAnswer, answered_at_ns: int | None = None) -> bytes:
@@ -142,7 +150,7 @@ def decode_update_answer(data: bytes) -> UpdateAnswer:
     Raises:
         WireError: as in `decode`.
     """
-    fields = _named(_with_rows(unpack(data, MAX_ANSWER_BYTES)))
+    fields = _named(_with_rows(unpack(data, MAX_ANSWER_BYTES)), of_newer=True)
     if isinstance(fields, dict) and "joints" in fields:
         fields["joints"] = _joint_samples(fields["joints"])
     return _validated(UpdateAnswer, fields)
@@ -233,15 +241,22 @@ def _with_rows(fields: Any) -> Any:
     return fields
 
 
-def _named(fields: Any) -> Any:
-    """What came, with the names of what travels without."""
+def _named(fields: Any, of_newer: bool) -> Any:
+    """What came, with the names of what travels without; a row `of_newer` sides may be longer than we know."""
     if isinstance(fields, dict):
         for name, model in ROWS.items():
             if name in fields:
                 row, names = fields[name], model.model_fields
-                if not isinstance(row, tuple) or len(row) != len(names):
-                    raise WireError(f"{name}: expected an array of {len(names)} values, got {repr(row)[:SHOWN_CHARS]}")
-                fields[name] = dict(zip(names, row, strict=True))
+                least, most = LEAST[name], len(names)
+                if not isinstance(row, tuple) or len(row) < least or (len(row) > most and not of_newer):
+                    count = f"{least}" if least == most else f"{least} to {most}"
+                    raise WireError(f"{name}: expected an array of {count} values, got {repr(row)[:SHOWN_CHARS]}")
+                # Shorter is an older unit's, longer a newer master's.
+                fields[name] = named = dict(zip(names, row, strict=False))
+                if isinstance(progress := named.get("progress"), tuple):
+                    if len(progress) > len(Progress.model_fields):
+                        raise WireError(f"{name}: expected a progress of 3 values, got {repr(progress)[:SHOWN_CHARS]}")
+                    named["progress"] = dict(zip(Progress.model_fields, progress, strict=False))
     return fields
 
 

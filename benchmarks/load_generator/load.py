@@ -38,7 +38,7 @@ from shared.camera import Intrinsics
 from shared.cell import Cell
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, MasterRefused, MasterUnreachable
-from shared.messages import CONTRACT_VERSION, InitializeRequest
+from shared.messages import CONTRACT_MINOR, CONTRACT_VERSION, InitializeRequest
 from shared.settings import Settings
 from shared.wire import MEDIA_TYPE
 
@@ -286,6 +286,7 @@ async def register(unit: SimpleUnit, url: str, token: str) -> None:
         answer = await client.initialize(
             InitializeRequest(
                 contract=CONTRACT_VERSION,
+                contract_minor=CONTRACT_MINOR,
                 serial=f"load-{unit.address}",
                 intrinsics=Intrinsics(848, 480, 430.0, 430.0, 424.0, 240.0),
                 sent_at_ns=monotonic_ns(),

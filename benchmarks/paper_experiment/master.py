@@ -24,7 +24,7 @@ from edge_unit.uplink.client import MasterClient
 from shared.camera import Intrinsics
 from shared.clock import NS_PER_MS, monotonic_ns, stage_ns
 from shared.errors import MasterRefused, MasterUnreachable, UplinkError, WireError
-from shared.messages import CONTRACT_VERSION, InitializeRequest, UpdateRequest, Versions
+from shared.messages import CONTRACT_MINOR, CONTRACT_VERSION, InitializeRequest, UpdateRequest, Versions
 from shared.timebase import Exchange
 from shared.transforms import Transform
 from shared.wire import MEDIA_TYPE, decode_update_answer, encode_update
@@ -59,7 +59,11 @@ class Member:
     async def register(self, intrinsics: Intrinsics, T_world_camera: Transform) -> None:
         """Ask for the slot and tell where the camera is: from now on the unit works with the master's newest."""
         request = InitializeRequest(
-            contract=CONTRACT_VERSION, serial=self.serial, intrinsics=intrinsics, sent_at_ns=monotonic_ns()
+            contract=CONTRACT_VERSION,
+            contract_minor=CONTRACT_MINOR,
+            serial=self.serial,
+            intrinsics=intrinsics,
+            sent_at_ns=monotonic_ns(),
         )
         answer = await self.client.initialize(request)
         pose = await self.client.put_pose(answer.id, T_world_camera, "configured")

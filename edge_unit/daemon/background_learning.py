@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from edge_unit.daemon.background_store import BackgroundStore, Place
 from edge_unit.joints import JointEstimate
 from edge_unit.pipeline import DepthPipeline, ReferenceLearner
-from shared.messages import DONE, Command
+from edge_unit.uplink.uplink import Trouble
+from shared.messages import DONE, Command, Outcome, Progress
 
 logger = logging.getLogger(__name__)
 
 LEARN_FRAMES = 60
 """Frames of the empty cell when an operator asks and the configuration names no number: four seconds at 15 fps."""
+
+POSE_CHANGED = "the camera's pose changed meanwhile"
 
 
 @dataclass
@@ -33,7 +36,7 @@ class _Lesson:
 class Learning:
     """What one unit has learned of its cell, and what it is learning."""
 
-    def __init__(self, store: BackgroundStore, frames: int | None, finish: Callable[[Command, str], None]) -> None:
+    def __init__(self, store: BackgroundStore, frames: int | None, finish: Callable[[Command, Outcome], None]) -> None:
         """`frames` are learned wherever nothing was learned before; None: only when asked for.
 
         `finish` is told what became of a command.
@@ -51,7 +54,7 @@ class Learning:
 
     def find(self, pipeline: DepthPipeline, place: Place) -> None:
         """Use what was learned at this place before, or else begin to learn if the configuration says so."""
-        self.end("the camera's pose changed meanwhile")
+        self.end(Outcome("superseded", POSE_CHANGED))
         stored = self._store.load(place)
         if stored is not None:
             logger.info("using the background learned before, from %d frames", stored.frames)
@@ -66,22 +69,23 @@ class Learning:
 
     def begin(self, pipeline: DepthPipeline, command: Command) -> None:
         """Learn anew, as `command` asks."""
-        self.end("it was asked to begin anew")
+        self.end(Outcome("superseded", "it was asked to begin anew"))
         pipeline.use(None)
         self._lesson = _Lesson(pipeline.learner(), self._frames or LEARN_FRAMES, command)
 
     def drop(self, pipeline: DepthPipeline, command: Command) -> None:
         """Forget what was learned, as `command` asks."""
-        self.end("it was asked to drop the background")
+        self.end(Outcome("superseded", "it was asked to drop the background"))
         pipeline.use(None)
         try:
             self._store.drop()
         except OSError as error:
-            self._finish(command, f"it is used no more, but comes back with the next start: {error}")
+            why = f"it is used no more, but comes back with the next start: {error}"
+            self._finish(command, Outcome("failed", why))
         else:
             self._finish(command, DONE)
 
-    def end(self, outcome: str) -> None:
+    def end(self, outcome: Outcome) -> None:
         """Learn no more; whoever asked for it is told the `outcome`."""
         if self._lesson is not None and self._lesson.command is not None:
             self._finish(self._lesson.command, outcome)
@@ -89,7 +93,7 @@ class Learning:
 
     def add(
         self, pipeline: DepthPipeline, place: Place, depth: NDArray[np.uint16], joints: JointEstimate | None
-    ) -> str | None:
+    ) -> Trouble | None:
         """Learn from a frame (H, W); returns why nothing is to be reported yet, None when nothing is to be learned.
 
         Raises:
@@ -99,11 +103,12 @@ class Learning:
         if lesson is None:
             return None
         if pipeline.cell.robot is not None and joints is None:
-            return "learning the background: it waits for the robot's joints"
+            return Trouble("joints", "learning the background: it waits for the robot's joints")
         pipeline.learn_frame(lesson.learner, depth, None if joints is None else joints.positions)
         done = lesson.learner.frames
         if done < lesson.frames:
-            return f"learning the background: frame {done} of {lesson.frames}"
+            progress = Progress(task="background", done=done, total=lesson.frames)
+            return Trouble("background", f"learning the background: frame {done} of {lesson.frames}", progress)
         reference = lesson.learner.reference()
         pipeline.use(reference)
         self.keep(pipeline, place)

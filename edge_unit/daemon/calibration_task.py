@@ -9,21 +9,21 @@ from edge_unit.calibration.board_layout import require_board
 from edge_unit.calibration.board_scan import BoardSearch
 from edge_unit.daemon.report import troubled
 from edge_unit.sources.frame import DepthFrame
-from edge_unit.uplink.uplink import Assignment, Uplink
+from edge_unit.uplink.uplink import Assignment, Trouble, Uplink
 from shared.errors import CellwatchError
-from shared.messages import DONE, PoseQuality
+from shared.messages import DONE, Outcome, PoseQuality
 
 logger = logging.getLogger(__name__)
 
 
-async def localise(search: BoardSearch, uplink: Uplink, assignment: Assignment, frame: DepthFrame) -> str:
+async def localise(search: BoardSearch, uplink: Uplink, assignment: Assignment, frame: DepthFrame) -> Outcome:
     """Look for the board while depth pauses, and tell the master the pose; returns what came of it.
 
     `frame` is the last one before the look: what is seen meanwhile is told as its trouble.
     """
 
     def tell(seen: str) -> None:
-        uplink.offer(troubled(assignment, frame, seen))
+        uplink.offer(troubled(assignment, frame, Trouble("board", seen)))
 
     first = not search.outcome
     try:
@@ -38,7 +38,7 @@ async def localise(search: BoardSearch, uplink: Uplink, assignment: Assignment, 
         # It looks for ever, but says so once.
         logger.log(logging.WARNING if first else logging.DEBUG, "%s", error)
         tell(f"looking for the board: {error}")
-        return str(error)
+        return Outcome("failed", str(error))
     logger.info(
         "found the board in %d of %d pictures: the pose is known to %.1f mm and %.2f degrees",
         found.frames_used,

@@ -15,9 +15,9 @@ from edge_unit.joints import JointEstimate
 from edge_unit.monitoring import Stages, Stance
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.sources.frame import DepthFrame
-from edge_unit.uplink.uplink import Assignment, Report
+from edge_unit.uplink.uplink import Assignment, Report, Trouble
 from shared.errors import InputError
-from shared.messages import Command
+from shared.messages import Command, Outcome
 from shared.transforms import Transform
 from shared.wire import keys_to_bytes
 
@@ -29,7 +29,7 @@ class FrameWork:
 
     def __init__(
         self,
-        finish: Callable[[Command, str], None],
+        finish: Callable[[Command, Outcome], None],
         assigned: AssignedPipeline,
         learning: Learning,
         refining: Refining,
@@ -62,7 +62,7 @@ class FrameWork:
             return self._report(pipeline, assignment, frame, joints, stages)
         except InputError as error:
             logger.warning("frame %d: %s", frame.frame_number, error)
-            return troubled(assignment, frame, str(error))
+            return troubled(assignment, frame, Trouble("frame", str(error)))
 
     def _prepare(self, assignment: Assignment, T_world_camera: Transform, changes: Iterable[Command]) -> DepthPipeline:
         """The pipeline as assignment and commands have it; without one, nothing can be changed."""
@@ -70,7 +70,7 @@ class FrameWork:
             pipeline = self._assigned.prepare(assignment, T_world_camera)
         except InputError as error:
             for command in changes:
-                self._finish(command, str(error))
+                self._finish(command, Outcome("refused", str(error)))
             raise
         for command in changes:
             self._obey(command, pipeline)
@@ -85,7 +85,7 @@ class FrameWork:
         elif command.verb == "refine":
             self._refining.begin(pipeline, command)
         else:
-            self._finish(command, f"this unit does not know how to {command.verb}")
+            self._finish(command, Outcome("refused", f"this unit does not know how to {command.verb}"))
 
     def _report(
         self,

@@ -17,7 +17,7 @@ from edge_unit.pipeline import picture_raw, png_of
 from edge_unit.sources.frame import DepthFrame
 from edge_unit.uplink.uplink import Uplink
 from shared.errors import CellwatchError, InputError
-from shared.messages import Command, ImageKind
+from shared.messages import Command, ImageKind, Outcome
 
 NO_POSE = "the pose of its camera is not known yet"
 
@@ -38,7 +38,7 @@ class Showing:
             try:
                 picture = await asyncio.to_thread(self._draw, command.image, frame, joints)
             except InputError as error:
-                self._uplink.finish(command, str(error))
+                self._uplink.finish(command, Outcome("refused", str(error)))
             else:
                 self._errands.start(self._send(command, picture))
 
@@ -57,6 +57,6 @@ class Showing:
             png = await asyncio.to_thread(png_of, picture, scale_m, command.raw)
             await self._uplink.send_picture(command, png)
         except CellwatchError as error:
-            self._uplink.finish(command, str(error))
+            self._uplink.finish(command, Outcome("failed", str(error)))
         else:
             self._uplink.finish(command)

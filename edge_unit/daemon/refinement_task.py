@@ -10,13 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_unit.daemon.background_learning import POSE_CHANGED
 from edge_unit.daemon.pipeline_manager import AssignedPipeline
 from edge_unit.joints import JointEstimate
 from edge_unit.monitoring import Stance
 from edge_unit.pipeline import DepthPipeline, Refiner
 from edge_unit.uplink.uplink import Uplink
-from shared.errors import CellwatchError, InputError
-from shared.messages import DONE, Command, PoseQuality
+from shared.errors import CellwatchError
+from shared.messages import Command, Outcome, PoseQuality
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +46,7 @@ class Refining:
     def begin(self, pipeline: DepthPipeline, command: Command) -> None:
         """Gather frames from now on, as `command` asks."""
         if self._gathered is not None:
-            self._uplink.finish(self._gathered.command, "it was asked to begin anew")
+            self._uplink.finish(self._gathered.command, Outcome("superseded", "it was asked to begin anew"))
         self._gathered = Gathered(command, [], pipeline.refiner())
 
     def gather(self, pipeline: DepthPipeline, depth: NDArray[np.uint16], joints: JointEstimate | None) -> None:
@@ -72,14 +73,15 @@ class Refining:
             found = await asyncio.to_thread(gathered.refiner.refine, gathered.frames)
             pipeline = self._assigned.pipeline
             if pipeline is None or not np.array_equal(pipeline.T_world_camera, gathered.refiner.T_world_camera):
-                raise InputError("the camera's pose changed meanwhile")
+                self._uplink.finish(gathered.command, Outcome("superseded", POSE_CHANGED))
+                return
             if found.accepted:
                 # Of a camera that moved, what was learned shows another place.
                 self._assigned.refined = None if self._stance.verdict.moved else found.T_world_camera
                 await self._uplink.tell_pose(found.T_world_camera, "refined", PoseQuality())
         except CellwatchError as error:
-            self._uplink.finish(gathered.command, str(error))
+            self._uplink.finish(gathered.command, Outcome("failed", str(error)))
         else:
-            outcome = f"{DONE}: {found.reason}" if found.accepted else found.reason
-            logger.info("refining the pose: %s", outcome)
+            outcome = Outcome("done" if found.accepted else "failed", found.reason)
+            logger.info("refining the pose: %s, %s", outcome.code, outcome.detail)
             self._uplink.finish(gathered.command, outcome)

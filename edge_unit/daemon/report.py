@@ -6,9 +6,9 @@ from __future__ import annotations
 from edge_unit.monitoring import Verdict
 from edge_unit.pipeline import FrameResult, SeenBlocks, StageTimes, Voxels
 from edge_unit.sources.frame import DepthFrame
-from edge_unit.uplink.uplink import Assignment, Report
+from edge_unit.uplink.uplink import Assignment, Report, Trouble
 from shared.clock import NS_PER_MS
-from shared.messages import MAX_TEXT, MAX_VOXELS, Health
+from shared.messages import MAX_VOXELS, Health
 from shared.transforms import Transform
 
 
@@ -49,7 +49,9 @@ def health_of(result: FrameResult, frame: DepthFrame, stance: Verdict, warning: 
     )
 
 
-def troubled(assignment: Assignment, frame: DepthFrame, trouble: str | None) -> Report:
+def troubled(assignment: Assignment, frame: DepthFrame, trouble: Trouble | None) -> Report:
     """A report that only says what is wrong: no voxels, nothing seen."""
-    health = Health(frame=frame.frame_number, trouble=None if trouble is None else trouble[:MAX_TEXT])
+    health = Health(frame=frame.frame_number)
+    if trouble is not None:
+        health = health.model_copy(update=trouble.facts())
     return Report(assignment, frame.captured_at_ns, health=health)

@@ -34,10 +34,10 @@ from edge_unit.sources.status import ReportsStatus
 from edge_unit.uplink.cell_cache import CellCache
 from edge_unit.uplink.client import MasterClient
 from edge_unit.uplink.master_discovery import MasterSearch
-from edge_unit.uplink.uplink import Assignment, Delivery, Report, Uplink
+from edge_unit.uplink.uplink import Assignment, Delivery, Report, Trouble, Uplink
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import InputError, SourceError
-from shared.messages import Command
+from shared.messages import Command, Outcome
 from shared.transforms import Transform
 
 logger = logging.getLogger(__name__)
@@ -135,7 +135,7 @@ class Unit:
         """One line for a person: camera, frames a second since it was asked last, master."""
         taken, now_ns = self._taken, monotonic_ns()
         (before, since_ns), self._told = self._told, (taken, now_ns)
-        trouble = self.uplink.trouble or self._trouble
+        trouble = self.uplink.trouble.sentence if self.uplink.trouble else self._trouble
         if trouble is None:
             trouble = f"live, {(taken - before) * NS_PER_S / max(now_ns - since_ns, 1):.1f} fps"
         return f"{trouble}; {self.uplink.standing}"
@@ -231,8 +231,9 @@ class Unit:
     async def _look_for_pose(self, assignment: Assignment, frame: DepthFrame, orders: Orders) -> None:
         """Say that nobody knows where the camera stands, and look for the board now and then."""
         self._assigned.pipeline = None
-        self._finish(orders.changes, NO_POSE)
-        searching = f"looking for the board: {self._search.outcome}" if self._search.outcome else None
+        self._finish(orders.changes, Outcome("refused", NO_POSE))
+        seen = self._search.outcome
+        searching = Trouble("board", f"looking for the board: {seen}") if seen else None
         report = troubled(assignment, frame, searching)
         self._trouble = report.health.trouble or NO_POSE
         self.uplink.offer(report)
@@ -277,6 +278,6 @@ class Unit:
             logger.info("%s", trouble or "frames are filtered and reported")
         self._trouble = trouble
 
-    def _finish(self, commands: list[Command], outcome: str) -> None:
+    def _finish(self, commands: list[Command], outcome: Outcome) -> None:
         for command in commands:
             self.uplink.finish(command, outcome)

@@ -10,7 +10,7 @@ from edge_unit.config import UnitConfig
 from edge_unit.monitoring.last_camera import CameraMemory
 from edge_unit.sources.frame import CameraInfo
 from edge_unit.sources.status import ReportsStatus
-from edge_unit.uplink.uplink import Uplink
+from edge_unit.uplink.uplink import Trouble, Uplink
 from shared.errors import SourceError
 from shared.messages import MAX_TEXT, ToldOrigin
 from shared.transforms import Transform
@@ -45,7 +45,7 @@ class CameraStanding:
     async def failed(self, error: SourceError) -> None:
         """It does not deliver."""
         logger.warning("%s", error)
-        self._uplink.trouble = f"camera: {error}"[:MAX_TEXT]
+        self._uplink.trouble = Trouble("camera", f"camera: {error}")
         await self._register_the_missing()
 
     async def follow(self, source: ReportsStatus) -> None:
@@ -54,7 +54,7 @@ class CameraStanding:
         while True:
             if status.state != "closed":
                 trouble = status.trouble
-                self._uplink.trouble = None if trouble is None else trouble[:MAX_TEXT]
+                self._uplink.trouble = None if trouble is None else Trouble("camera", trouble)
                 self._uplink.warning = status.warning[:MAX_TEXT] or None
                 if status.state == "absent":
                     await self._register_the_missing()

@@ -13,8 +13,10 @@ from urllib.parse import urlsplit
 import httpx
 
 from edge_unit.tls import tls_context
-from shared.errors import ConfigError, MasterRefused, MasterUnreachable, WireError
+from shared.errors import ConfigError, MasterRefused, MasterUnreachable, NewerContract, WireError
 from shared.messages import (
+    CONTRACT_MINOR,
+    CONTRACT_VERSION,
     ImageKind,
     InitializeAnswer,
     InitializeRequest,
@@ -22,6 +24,7 @@ from shared.messages import (
     PoseQuality,
     PoseRequest,
     RobotAnswer,
+    SlotAnswer,
     UpdateAnswer,
     UpdateRequest,
 )
@@ -123,8 +126,34 @@ class MasterClient:
         self._http.headers["Authorization"] = f"Bearer {token}"
 
     async def initialize(self, request: InitializeRequest) -> InitializeAnswer:
-        """Ask for a slot. Raises as `update`."""
-        return decode(InitializeAnswer, await self._call("POST", "/initialize", encode(request)))
+        """Ask for a slot.
+
+        Raises as `update`, and besides:
+            MasterRefused: the master speaks an older contract than the unit.
+            NewerContract: it speaks a newer one, and asks what this unit does not know.
+        """
+        try:
+            data = await self._call("POST", "/initialize", encode(request))
+        except MasterRefused as error:
+            # All that a master of contract 5.0 has to say of a minor number.
+            if error.status == 422 and error.detail.startswith("contract_minor:"):
+                raise self._older(0) from error
+            raise
+        try:
+            answer = decode(InitializeAnswer, data)
+        except WireError as error:
+            if decode(SlotAnswer, data).contract_minor > CONTRACT_MINOR:
+                raise NewerContract(str(error), data) from error
+            raise
+        if answer.contract_minor < request.contract_minor:
+            raise self._older(answer.contract_minor)
+        return answer
+
+    def _older(self, minor: int) -> MasterRefused:
+        """What a master of an older minor has refused, whether it knows or not."""
+        ours = f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
+        detail = f"contract: this master speaks version {CONTRACT_VERSION}.{minor}, this unit {ours}"
+        return MasterRefused(f"{self.url}/initialize: {detail}; update the master first", 400, detail)
 
     async def update(self, update: UpdateRequest) -> UpdateAnswer:
         """Report a frame.
@@ -188,7 +217,8 @@ class MasterClient:
         except httpx.HTTPError as error:
             raise MasterUnreachable(f"{self.url}{path}: {str(error) or type(error).__name__}") from error
         if response.is_error:
-            raise MasterRefused(f"{self.url}{path}: {response.status_code}: {_reason(received)}", response.status_code)
+            status, detail = response.status_code, _reason(received)
+            raise MasterRefused(f"{self.url}{path}: {status}: {detail}", status, detail)
         return bytes(received)
 
 

@@ -16,7 +16,7 @@ from ipaddress import IPv4Address, IPv4Interface
 from urllib.parse import urlsplit
 
 from shared.discovery import SHA_DIGITS, Offer, shortened
-from shared.messages import CONTRACT_VERSION
+from shared.messages import CONTRACT_MINOR, CONTRACT_VERSION
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,10 @@ def distrusted(kept: Kept, wanted: Wanted) -> bool:
 def objection(offer: Offer, wanted: Wanted, kept: Kept | None) -> str | None:
     """Why this master is not for us, or None; what it says of itself is only ever held against it."""
     says = offer.says
-    if says.contract != CONTRACT_VERSION:
-        return f"it speaks contract {says.contract}, this unit {CONTRACT_VERSION}"
+    if says.contract != CONTRACT_VERSION or says.minor < CONTRACT_MINOR:
+        older = "this unit" if says.contract > CONTRACT_VERSION else "the master"
+        theirs, ours = f"{says.contract}.{says.minor}", f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
+        return f"it speaks contract {theirs}, this unit {ours}; update {older} first"
     if wanted.checked and not says.tls:
         return "it does not speak TLS, and its certificate is to be checked"
     if wanted.fingerprint is not None and says.fingerprint != wanted.fingerprint[:SHA_DIGITS]:

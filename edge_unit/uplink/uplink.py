@@ -23,7 +23,7 @@ import logging
 import random
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from edge_unit.joints import JointHistory
 from edge_unit.pipeline import SeenBlocks
@@ -32,23 +32,37 @@ from edge_unit.uplink.cell_cache import CellCache
 from edge_unit.uplink.client import MasterClient
 from edge_unit.uplink.master_discovery import MasterSearch
 from shared.cell import Cell
-from shared.clock import monotonic_ns
-from shared.errors import CellwatchError, ConfigError, MasterRefused, MasterUnreachable, WireError
+from shared.clock import NS_PER_S, monotonic_ns
+from shared.errors import (
+    CellError,
+    CellwatchError,
+    ConfigError,
+    MasterRefused,
+    MasterUnreachable,
+    NewerContract,
+    WireError,
+)
 from shared.lattice import Lattice
 from shared.messages import (
+    CONTRACT_MINOR,
     CONTRACT_VERSION,
     DONE,
     MAX_COMMANDS,
     MAX_TEXT,
     CellReference,
     Command,
+    Ended,
     Health,
+    InitializeAnswer,
     InitializeRequest,
     Outcome,
     Phase,
     PoseQuality,
+    Progress,
     SeenReport,
+    SlotAnswer,
     ToldOrigin,
+    TroubleCode,
     UpdateAnswer,
     UpdateRequest,
     Versions,
@@ -58,7 +72,7 @@ from shared.settings import Settings
 from shared.timebase import ClockOffset, Exchange
 from shared.transforms import Transform, validated
 from shared.waiting import within
-from shared.wire import pack_seen
+from shared.wire import decode, pack_seen
 
 logger = logging.getLogger(__name__)
 
@@ -74,6 +88,9 @@ JOINTS_TIMEOUT_S = 0.02
 
 NOT_OURS = frozenset({400, 401, 403, 404, 405, 426})
 """Who answers a registration like this is no master for us: of another contract or token, or none at all."""
+
+CONTRACT_RETRY_S = 5.0
+"""Before a newer master that was not understood is asked again, although it told no change."""
 
 START_OVER = frozenset({401, 403, 404, 409})
 """The master does not know this token, unit, session or address any more: register again."""
@@ -104,6 +121,28 @@ class Report:
     seen: SeenBlocks | None = None
     health: Health = field(default_factory=Health)
     stages_ns: dict[str, int] = field(default_factory=dict)
+
+
+class Trouble(NamedTuple):
+    """Why a unit reports no voxels: a code, a sentence, and how far it is with what is to be waited for."""
+
+    code: TroubleCode
+    sentence: str
+    progress: Progress | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """The fields of `Health` that tell it; a sentence that is too long is cut."""
+        return {"trouble": self.sentence[:MAX_TEXT], "trouble_code": self.code, "progress": self.progress}
+
+
+@dataclass(frozen=True)
+class _Unclear:
+    """A session of which this unit does not understand all that it would have to obey."""
+
+    session: int
+    versions: Versions
+    trouble: Trouble
+    since_ns: int
 
 
 class Delivery(NamedTuple):
@@ -149,15 +188,18 @@ class Uplink:
         self._found_by = ""
         self._id = 0
         self._sequence = 0
-        self._done: list[Outcome] = []
+        self._done: list[Ended] = []
         self._open_commands: dict[int, Command] = {}
+        self._master_minor = 0
+        self._unclear: _Unclear | None = None
+        self._refused = ""
         self.assignment: Assignment | None = None
         self.assigned = asyncio.Event()
         self.phase: Phase | None = None
         self.commands: asyncio.Queue[Command] = asyncio.Queue(MAX_COMMANDS)
         self.joints = JointHistory()
         self.clock = ClockOffset()
-        self.trouble: str | None = None
+        self.trouble: Trouble | None = None
         self.warning: str | None = None
 
     # ------------------------------------------------------------------ what the unit calls
@@ -184,10 +226,10 @@ class Uplink:
         self._idle.clear()
         self._wake.set()
 
-    def finish(self, command: Command, outcome: str = DONE) -> None:
+    def finish(self, command: Command, outcome: Outcome = DONE) -> None:
         """A command came to an end: carried out, or why not; the master is told with the next update."""
         if command.id in self._open_commands:
-            self._done.append(Outcome(command.id, outcome[:MAX_TEXT]))
+            self._done.append(Ended.of(command.id, outcome))
 
     async def send_picture(self, command: Command, png: bytes) -> None:
         """Send the picture that a command asks for. Raises as `MasterClient.update`."""
@@ -214,6 +256,8 @@ class Uplink:
             return f"no master: {self._search.outcome}"
         if self._complaint:
             return f"no master: {self._complaint}"
+        if self._unclear is not None:
+            return self._unclear.trouble.sentence
         if self.assignment is None:
             return f"not registered yet at {self._client.url}"
         return f"unit {self._id} at {self._client.url}"
@@ -243,7 +287,9 @@ class Uplink:
             try:
                 await self._turn_to_master()
                 assignment = self.assignment
-                if assignment is None:
+                if self._unclear is not None:
+                    await self._tell_unclear(self._unclear)
+                elif assignment is None:
                     await self._register()
                 else:
                     await self._report(assignment)
@@ -253,12 +299,16 @@ class Uplink:
                 if self.phase == "searching" and self.assignment is not None:
                     self._enter(_phase_of(self.assignment), f"{self._client.url} answers again")
             except MasterRefused as error:
-                if error.status in START_OVER and self.assignment is not None:
+                registered = self.assignment is not None or self._unclear is not None
+                if error.status in START_OVER and registered:
                     self._start_over()
                 self._miss(error, error.status in NOT_OURS and self.assignment is None)
                 retry_s = await self._wait(retry_s, error)
             except CellwatchError as error:
-                foreign = isinstance(error, WireError) and self.assignment is None
+                foreign = isinstance(error, WireError) and self.assignment is None and self._unclear is None
+                if isinstance(error, (WireError, CellError)) and self._master_minor > CONTRACT_MINOR:
+                    # What registering anew cannot clear up is told as trouble then.
+                    self._start_over()
                 self._miss(error, foreign or isinstance(error, MasterUnreachable))
                 retry_s = await self._wait(retry_s, error)
 
@@ -298,25 +348,47 @@ class Uplink:
         await self._client.authorize()
         told, origin = self._known_pose or (None, "configured")
         sent_at_ns = monotonic_ns()
-        answer = await self._client.initialize(
-            InitializeRequest(
-                contract=CONTRACT_VERSION,
-                serial=camera.serial,
-                model=camera.model,
-                intrinsics=camera.intrinsics,
-                software=self._software,
-                boot_id=self._boot_id,
-                T_world_camera=None if told is None else matrix_of(told),
-                pose_origin=origin,
-                sent_at_ns=sent_at_ns,
-            )
+        request = InitializeRequest(
+            contract=CONTRACT_VERSION,
+            contract_minor=CONTRACT_MINOR,
+            serial=camera.serial,
+            model=camera.model,
+            intrinsics=camera.intrinsics,
+            software=self._software,
+            boot_id=self._boot_id,
+            T_world_camera=None if told is None else matrix_of(told),
+            pose_origin=origin,
+            sent_at_ns=sent_at_ns,
         )
+        try:
+            answer = await self._client.initialize(request)
+        except NewerContract as error:
+            slot = decode(SlotAnswer, error.answer)
+            self._begin_session(slot, sent_at_ns)
+            self._refuse(slot, error)
+            return
+        self._begin_session(answer, sent_at_ns)
+        self.joints.add(answer.joints)
+        self._enter("fetching", f"unit {answer.id}, cell {answer.cell.name}")
+        try:
+            cell = await self._get_cell(answer.cell)
+        except (WireError, CellError) as error:
+            if answer.contract_minor <= CONTRACT_MINOR:
+                raise
+            self._refuse(answer, error)
+            return
+        pose = None if answer.T_world_camera is None else validated(answer.T_world_camera, "T_world_camera")
+        assignment = Assignment(answer.session, answer.versions, answer.settings, answer.lattice.lattice(), cell, pose)
+        self._assign(assignment, f"registered at {self._client.url} as unit {answer.id}, ")
+
+    def _begin_session(self, slot: InitializeAnswer | SlotAnswer, sent_at_ns: int) -> None:
+        """Registered at `sent_at_ns`: what was before is void."""
         self.clock = ClockOffset()
         self.joints.clear()
-        self._exchange = Exchange(sent_at_ns, answer.received_at_ns, answer.answered_at_ns, monotonic_ns())
+        self._exchange = Exchange(sent_at_ns, slot.received_at_ns, slot.answered_at_ns, monotonic_ns())
         self.clock.add(self._exchange)
-        self.joints.add(answer.joints)
-        self._id = answer.id
+        self._master_minor = slot.contract_minor
+        self._id = slot.id
         self._sequence = 0
         self._acknowledged = None
         self._done.clear()
@@ -324,11 +396,60 @@ class Uplink:
         # Those of the session before; the master sends again what it still wants.
         while not self.commands.empty():
             self.commands.get_nowait()
-        self._enter("fetching", f"unit {answer.id}, cell {answer.cell.name}")
-        cell = await self._get_cell(answer.cell)
-        pose = None if answer.T_world_camera is None else validated(answer.T_world_camera, "T_world_camera")
-        assignment = Assignment(answer.session, answer.versions, answer.settings, answer.lattice.lattice(), cell, pose)
-        self._assign(assignment, f"registered at {self._client.url} as unit {answer.id}, ")
+
+    def _refuse(self, slot: InitializeAnswer | SlotAnswer, error: CellwatchError) -> None:
+        """Do not follow a newer master that is not understood: what is unknown may have to be left unfiltered."""
+        theirs, ours = f"{CONTRACT_VERSION}.{slot.contract_minor}", f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
+        trouble = Trouble("contract", f"update this unit: it speaks contract {ours}, its master {theirs}: {error}")
+        self._unclear = _Unclear(slot.session, slot.versions, trouble, monotonic_ns())
+        level = logging.DEBUG if trouble.sentence == self._refused else logging.WARNING
+        logger.log(level, "%s", trouble.sentence)
+        self._refused = trouble.sentence
+
+    async def _tell_unclear(self, unclear: _Unclear) -> None:
+        """Tell why nothing is reported; register again when the master says something else, or now and then."""
+        self._drop_fresh()
+        await self._woken()
+        self._drop_fresh()
+        sent_at_ns = monotonic_ns()
+        if sent_at_ns - unclear.since_ns > CONTRACT_RETRY_S * NS_PER_S:
+            self._start_over()
+            return
+        self._sequence += 1
+        answer = await self._client.update(
+            UpdateRequest(
+                id=self._id,
+                session=unclear.session,
+                sequence=self._sequence,
+                sent_at_ns=sent_at_ns,
+                exchange=self._exchange,
+                # Not that it works with these, but that it knows of them: so it is not told of them again.
+                versions=unclear.versions,
+                health=Health().model_copy(update=unclear.trouble.facts()),
+                phase="fetching",
+            )
+        )
+        self._exchange = Exchange(sent_at_ns, answer.received_at_ns, answer.answered_at_ns, monotonic_ns())
+        self.clock.add(self._exchange)
+        if answer.versions != unclear.versions:
+            self._start_over()
+
+    def _drop_fresh(self) -> None:
+        """What was offered will not be sent."""
+        if self._fresh is not None:
+            self._on_sent(self._fresh, None)
+            self._fresh = None
+        self._idle.set()
+
+    async def _woken(self) -> None:
+        """Wait until something is to be sent, but no longer than until the next heartbeat."""
+        self._wake.clear()
+        # No wait_for here: until Python 3.12 it swallows a cancellation that comes together with the event.
+        heartbeat = asyncio.get_running_loop().call_later(HEARTBEAT_S, self._wake.set)
+        try:
+            await self._wake.wait()
+        finally:
+            heartbeat.cancel()
 
     async def _get_cell(self, reference: CellReference) -> Cell:
         cell = await self._cells.get(reference, self._client)
@@ -339,20 +460,14 @@ class Uplink:
     async def _report(self, assignment: Assignment) -> None:
         """Send the latest report, or, when none comes, the one before again."""
         if self._fresh is None:
-            self._wake.clear()
-            # No wait_for here: until Python 3.12 it swallows a cancellation that comes together with the event.
-            heartbeat = asyncio.get_running_loop().call_later(HEARTBEAT_S, self._wake.set)
-            try:
-                await self._wake.wait()
-            finally:
-                heartbeat.cancel()
+            await self._woken()
         fresh, self._fresh = self._fresh, None
         report = fresh or self._last or Report(assignment)
         if report.assignment.session != assignment.session:
             # Made for a session that is over, in which the same versions may have meant something else.
             if fresh is not None:
                 self._on_sent(fresh, None)
-            report = Report(assignment, health=Health(trouble=self.trouble))
+            report = Report(assignment)
         self._last = report
         try:
             answer, delivery = await self._exchange_update(assignment, report)
@@ -384,10 +499,10 @@ class Uplink:
             self._acknowledged = None
         done = tuple(self._done[:MAX_COMMANDS])
         health = report.health
-        if self.trouble is not None or self.warning is not None:
-            health = health.model_copy(
-                update={"trouble": self.trouble or health.trouble, "warning": self.warning or health.warning}
-            )
+        if self.trouble is not None:
+            health = health.model_copy(update=self.trouble.facts())
+        if self.warning is not None:
+            health = health.model_copy(update={"warning": self.warning})
         sent_at_ns = monotonic_ns()
         answer = await self._client.update(
             UpdateRequest(
@@ -440,10 +555,10 @@ class Uplink:
                 self._open_commands[command.id] = command
                 self.commands.put_nowait(command)
 
-    def _forget_commands(self, done: Iterable[Outcome]) -> None:
-        for outcome in done:
-            self._done.remove(outcome)
-            self._open_commands.pop(outcome.id, None)
+    def _forget_commands(self, done: Iterable[Ended]) -> None:
+        for ended in done:
+            self._done.remove(ended)
+            self._open_commands.pop(ended.id, None)
 
     def _assign(self, assignment: Assignment, how: str = "") -> None:
         self.assignment = assignment
@@ -453,6 +568,7 @@ class Uplink:
 
     def _start_over(self) -> None:
         self.assignment = None
+        self._unclear = None
         self.assigned.clear()
 
     async def _wait(self, retry_s: float, error: CellwatchError) -> float:

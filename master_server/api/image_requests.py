@@ -24,7 +24,7 @@ class _Awaited:
     expires_at_ns: int
     arrived: asyncio.Event = field(default_factory=asyncio.Event)
     png: bytes | None = None
-    outcome: str = ""
+    outcome: Outcome = DONE
 
 
 class Pictures:
@@ -47,8 +47,8 @@ class Pictures:
             awaited = _Awaited(0, now_ns + round(IMAGE_EXPIRES_S * NS_PER_S))
 
             def end(outcome: Outcome, awaited: _Awaited = awaited) -> None:
-                if awaited.png is None and outcome.text != DONE:
-                    self._end(awaited, outcome.text)
+                if awaited.png is None and outcome.code != "done":
+                    self._end(awaited, outcome)
 
             awaited.command_id = self._registry.ask(slot, "image", now_ns, kind, raw, end).id
             self._awaited[key] = awaited
@@ -57,7 +57,7 @@ class Pictures:
                 del self._awaited[key]
             raise Refusal(504, f"unit {unit_id}: its picture did not come within {IMAGE_EXPIRES_S:g} s, see GET /units")
         if awaited.png is None:
-            raise Refusal(409, f"unit {unit_id}: no picture: {awaited.outcome}")
+            raise Refusal(409, f"unit {unit_id}: no picture: {awaited.outcome.sentence}")
         return awaited.png
 
     def check_awaited(self, unit_id: int, command_id: int) -> None:
@@ -82,7 +82,7 @@ class Pictures:
                 return awaited
         raise Refusal(409, f"unit {unit_id}: nobody waits for the picture of command {command_id}")
 
-    def _end(self, awaited: _Awaited, outcome: str) -> None:
+    def _end(self, awaited: _Awaited, outcome: Outcome) -> None:
         awaited.outcome = outcome
         awaited.arrived.set()
         for key in [key for key, one in self._awaited.items() if one is awaited]:

@@ -7,6 +7,7 @@ Labels are ids, addresses and states of at most `MAX_UNITS` units; what a unit s
 from __future__ import annotations
 
 import importlib.metadata
+from collections import Counter
 from collections.abc import Iterator
 from typing import get_args
 
@@ -114,6 +115,12 @@ class Metrics(Collector):
 
     def _map(self, now_ns: int) -> Iterator[Metric]:
         view = self._master.view(now_ns)
+        incomplete = GaugeMetricFamily(
+            "cellwatch_map_incomplete", "Reasons why the map is not complete, by code.", labels=("code",)
+        )
+        for code, count in sorted(Counter(cause.code for cause in view.causes).items()):
+            incomplete.add_metric((code,), count)
+        yield incomplete
         seen_share = 1.0 - coverage_shares(self._master.seen_by(now_ns))[0]
         yield GaugeMetricFamily("cellwatch_map_voxels", "Obstacle voxels in the merged map.", len(view.keys))
         yield GaugeMetricFamily("cellwatch_map_complete", "1 when the map is complete.", float(view.complete))

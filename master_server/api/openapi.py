@@ -25,6 +25,7 @@ from shared.camera import Intrinsics
 from shared.clock import monotonic_ns
 from shared.errors import Refusal
 from shared.messages import (
+    CONTRACT_MINOR,
     CONTRACT_VERSION,
     Health,
     InitializeRequest,
@@ -186,6 +187,7 @@ class Examples:
     def _initialize(self) -> dict[str, Any]:
         request = InitializeRequest(
             contract=CONTRACT_VERSION,
+            contract_minor=CONTRACT_MINOR,
             serial="233522071234",
             model="Intel RealSense D435",
             intrinsics=Intrinsics(848, 480, 425.0, 425.0, 423.5, 239.5),

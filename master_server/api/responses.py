@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 
 from master_server.core import MapView, Readable, UnitState
 from shared.lattice import Lattice
-from shared.messages import LatticeDescription, VoxelsAnswer
+from shared.messages import LatticeDescription, Reason, VoxelsAnswer
 
 Form = Literal["indices", "centres", "keys"]
 
@@ -47,6 +47,7 @@ class CoverageAnswer(BaseModel):
     block_size_m: float
     complete: bool = Field(description="As in `GET /voxels`.")
     reasons: list[str]
+    causes: list[Reason] = Field(default=[], description="As in `GET /voxels`.")
     units_live: int
     now_ns: int
     blocks: BlockCounts | None = None
@@ -61,6 +62,7 @@ def map_fields(view: MapView, form: Form, unseen: dict[str, Any] | None, now_ns:
         "witnesses": np.ascontiguousarray(view.witnesses),
         "complete": view.complete,
         "reasons": list(view.reasons),
+        "causes": list(view.causes),
         "oldest_view_age_s": None if view.oldest_view_age_s is None else round(view.oldest_view_age_s, 4),
         "units_live": view.units_live,
         "now_ns": now_ns,
@@ -90,6 +92,7 @@ def coverage_fields(master: Readable, with_blocks: bool, now_ns: int) -> dict[st
         "block_size_m": blocks.voxel_size_m,
         "complete": view.complete,
         "reasons": list(view.reasons),
+        "causes": list(view.causes),
         "units_live": view.units_live,
         "now_ns": now_ns,
         "blocks": _block_counts(blocks, seen_by) if with_blocks else None,

@@ -18,13 +18,14 @@ from master_server.cells.published import PublishedCell
 from master_server.core.coverage import Coverage
 from master_server.core.merged_map import NO_KEYS, MergedMap
 from master_server.core.robot_joints import RobotJoints
-from master_server.core.units import Registry, Slot, UnitState
+from master_server.core.units import Registry, Slot, UnitState, sentence_of
 from master_server.persistence import Store, beginning
 from shared.cell import Cell
 from shared.configuration import sentence
 from shared.errors import Refusal
 from shared.lattice import Lattice
 from shared.messages import (
+    CONTRACT_MINOR,
     CONTRACT_VERSION,
     CellAnswer,
     Command,
@@ -35,6 +36,8 @@ from shared.messages import (
     Matrix,
     PoseOrigin,
     PoseQuality,
+    Reason,
+    ReasonCode,
     RobotAnswer,
     State,
     UnitRow,
@@ -42,6 +45,7 @@ from shared.messages import (
     UpdateRequest,
     Verb,
     Versions,
+    is_newer,
     matrix_of,
 )
 from shared.settings import Settings
@@ -55,7 +59,8 @@ logger = logging.getLogger(__name__)
 class MapView:
     """The merged map at one time: keys (N,) uint32 ascending, witnesses (N,) uint8; and whether it is all there is.
 
-    `reports` are the keys of each live unit by its id, of which it was merged.
+    `reports` are the keys of each live unit by its id, of which it was merged; `causes` the reasons for programs, in
+    the same order (recordings of contract 5.0 have none).
     """
 
     lattice: Lattice
@@ -66,6 +71,7 @@ class MapView:
     oldest_view_age_s: float | None
     units_live: int
     reports: Mapping[int, NDArray[np.uint32]] = field(default_factory=dict)
+    causes: tuple[Reason, ...] = ()
 
     @property
     def complete(self) -> bool:
@@ -117,8 +123,13 @@ class Master:
             Refusal: it speaks another contract, its camera reports from elsewhere, another camera reports from
                 its IP, there are too many units, or it cannot be stored.
         """
-        if request.contract != CONTRACT_VERSION:
-            raise Refusal(400, f"contract: this master speaks version {CONTRACT_VERSION}, the unit {request.contract}")
+        if request.contract != CONTRACT_VERSION or request.contract_minor > CONTRACT_MINOR:
+            first = "the master" if is_newer(request.contract, request.contract_minor) else "the unit"
+            raise Refusal(
+                400,
+                f"contract: this master speaks version {CONTRACT_VERSION}.{CONTRACT_MINOR}, the unit "
+                f"{request.contract}.{request.contract_minor}; update {first} first",
+            )
         slot, retired = self.registry.initialize(request, ip, now_ns, self.settings.stale_after_s)
         for gone in (slot, *retired):
             self._withdraw(gone.id)
@@ -135,6 +146,7 @@ class Master:
             joints=self.robot.since(0),
             received_at_ns=now_ns,
             answered_at_ns=now_ns,
+            contract_minor=CONTRACT_MINOR,
         )
 
     def update(self, update: UpdateRequest, ip: str, now_ns: int) -> UpdateAnswer:
@@ -156,14 +168,14 @@ class Master:
             self.coverage.report(slot.id, update.seen)
         self.map.replace(slot.id, keys)
         slot.session.take_in(update, now_ns)
-        for outcome in update.done:
-            slot.end(outcome)
+        for ended in update.done:
+            slot.end(ended.id, ended.outcome)
         self._notice(slot, now_ns)
         self._changed()
         return self._answer(slot, update, now_ns)
 
-    def judge(self, slot: Slot, now_ns: int) -> tuple[State, str]:
-        """A unit's state now, and why in words."""
+    def judge(self, slot: Slot, now_ns: int) -> tuple[State, Reason | None]:
+        """A unit's state now, and why."""
         return slot.judge(now_ns, self.versions, self.settings)
 
     def tick(self, now_ns: int) -> None:
@@ -189,10 +201,11 @@ class Master:
         """Of each row what a stream tells at every change."""
         rows = []
         for slot in self.registry:
-            state, reason = self.judge(slot, now_ns)
+            state, cause = self.judge(slot, now_ns)
             age_s = slot.session.age_s(now_ns)
             voxels = len(self.map.keys_of(slot.id))
-            rows.append(UnitState(slot.id, slot.ip, state, reason, None if age_s is None else round(age_s, 4), voxels))
+            age_s = None if age_s is None else round(age_s, 4)
+            rows.append(UnitState(slot.id, slot.ip, state, sentence_of(cause), cause, age_s, voxels))
         return rows
 
     def forget(self, unit_id: int) -> None:
@@ -239,34 +252,36 @@ class Master:
 
     def view(self, now_ns: int) -> MapView:
         """The union of what live units report, and what it lacks (Algorithm 9)."""
-        reasons: list[str] = []
+        causes: list[Reason] = []
         live: list[int] = []
         oldest_s: float | None = None
         for slot in self.registry:
-            state, reason = self.judge(slot, now_ns)
+            state, cause = self.judge(slot, now_ns)
             if state != "live":
-                reasons.append(f"unit {slot.id} ({slot.ip}) is {state}: {reason}")
+                assert cause is not None
+                causes.append(_of_unit(slot, cause.code, f"is {state}: {cause.sentence}", cause.numbers))
                 continue
             live.append(slot.id)
             age_s = slot.session.age_s(now_ns) or 0.0
             oldest_s = age_s if oldest_s is None else max(oldest_s, age_s)
             if not self.coverage.has(slot.id):
-                reasons.append(f"unit {slot.id} ({slot.ip}) has not reported what it looks through")
+                causes.append(_of_unit(slot, "not_seen", "has not reported what it looks through"))
         if not len(self.registry):
-            reasons.append("there is no unit")
-        robot_state, robot_reason = self.robot.state(now_ns, self.settings.robot_stale_after_s)
-        if robot_state not in ("fresh", "none"):
-            reasons.append(robot_reason)
+            causes.append(Reason("no_unit", "there is no unit"))
+        _, robot_cause = self.robot.state(now_ns, self.settings.robot_stale_after_s)
+        if robot_cause is not None:
+            causes.append(robot_cause)
         keys, witnesses = self.map.voxels(live)
         return MapView(
             self.lattice,
             self.versions.lattice,
             keys,
             witnesses,
-            tuple(reasons),
+            tuple(cause.sentence for cause in causes),
             oldest_s,
             len(live),
             self.map.reports(live),
+            tuple(causes),
         )
 
     def seen_by(self, now_ns: int) -> NDArray[np.uint8]:
@@ -294,13 +309,13 @@ class Master:
 
     def robot_answer(self, since_ns: int | None, now_ns: int) -> RobotAnswer:
         """The newest joints, or all after `since_ns`."""
-        state, reason = self.robot.state(now_ns, self.settings.robot_stale_after_s)
+        state, cause = self.robot.state(now_ns, self.settings.robot_stale_after_s)
         age_s = self.robot.age_s(now_ns)
         newest = self.robot.newest
         samples = self.robot.since(since_ns) if since_ns is not None else () if newest is None else (newest,)
         return RobotAnswer(
             state=state,
-            reason=reason,
+            reason=sentence_of(cause),
             joint_names=self.robot.joint_names or (),
             age_s=None if age_s is None else round(age_s, 4),
             now_ns=now_ns,
@@ -407,9 +422,9 @@ class Master:
     def _notice(self, slot: Slot, now_ns: int) -> None:
         if slot.asked:
             slot.expire(now_ns)
-        state, reason = self.judge(slot, now_ns)
+        state, cause = self.judge(slot, now_ns)
         if state != slot.told_state:
-            slot.tell(state, reason)
+            slot.tell(state, cause)
 
     def _answer(self, slot: Slot, update: UpdateRequest, now_ns: int) -> UpdateAnswer:
         current, theirs = self._versions_for(slot), update.versions
@@ -434,3 +449,8 @@ class Master:
     def _versions_for(self, slot: Slot) -> Versions:
         ours = self.versions
         return Versions(settings=ours.settings, lattice=ours.lattice, cell=ours.cell, pose=slot.pose_version)
+
+
+def _of_unit(slot: Slot, code: ReasonCode, what: str, numbers: Mapping[str, float] | None = None) -> Reason:
+    """A reason that is about one unit."""
+    return Reason(code, f"unit {slot.id} ({slot.ip}) {what}", {"unit": float(slot.id), **(numbers or {})})

@@ -9,7 +9,7 @@ from typing import Literal
 
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.errors import Refusal
-from shared.messages import MAX_JOINT_SAMPLES, JointSample, JointsRequest
+from shared.messages import MAX_JOINT_SAMPLES, JointSample, JointsRequest, Reason
 
 HISTORY_SAMPLES = 2048
 """Four seconds of a robot that reports at 500 Hz; no unit's frame is older when it is still of use."""
@@ -79,13 +79,14 @@ class RobotJoints:
         newest = self.newest
         return None if newest is None else newest.at_ns + round(stale_after_s * NS_PER_S)
 
-    def state(self, now_ns: int, stale_after_s: float) -> tuple[RobotState, str]:
-        """Whether units can filter the robot, and why not in words."""
+    def state(self, now_ns: int, stale_after_s: float) -> tuple[RobotState, Reason | None]:
+        """Whether units can filter the robot, and why not."""
         if self.joint_names is None:
-            return "none", ""
+            return "none", None
         age_s = self.age_s(now_ns)
         if age_s is None:
-            return "silent", "the robot has not reported its joints yet"
+            return "silent", Reason("robot_silent", "the robot has not reported its joints yet")
         if age_s > stale_after_s:
-            return "stale", f"the robot's joints are {age_s:.1f} s old, at most {stale_after_s:g} s are trusted"
-        return "fresh", ""
+            text = f"the robot's joints are {age_s:.1f} s old, at most {stale_after_s:g} s are trusted"
+            return "stale", Reason("robot_stale", text, {"age_s": round(age_s, 1), "limit_s": stale_after_s})
+        return "fresh", None

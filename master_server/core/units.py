@@ -30,6 +30,8 @@ from shared.messages import (
     Phase,
     PoseOrigin,
     PoseQuality,
+    Reason,
+    ReasonCode,
     State,
     UnitRow,
     UpdateRequest,
@@ -65,6 +67,9 @@ MOVED_AGREEING_SHARE = 0.1
 MOVED_STATIC_SHARE = 0.1
 """With fewer pixels before known surfaces there is nothing to tell a moved camera by."""
 
+SILENT: tuple[ReasonCode, ...] = ("no_update", "late_update")
+"""Nothing is heard of the unit: what it said before counts for nothing."""
+
 COMMAND_EXPIRES_S = 600.0
 """Learning the background at one frame a second takes minutes; what is not answered after ten of them never will be."""
 
@@ -86,6 +91,7 @@ class UnitState:
     ip: str
     state: State
     reason: str
+    cause: Annotated[Reason | None, Field(description="The reason for programs.")]
     age_s: Annotated[float | None, Field(description="Since the capture of its last frame.")]
     voxels: int
 
@@ -102,7 +108,7 @@ class _Asked:
     def unanswered(self) -> Outcome:
         """What becomes of it when the unit does not answer in time."""
         limit_s = IMAGE_EXPIRES_S if self.command.verb == "image" else COMMAND_EXPIRES_S
-        return Outcome(self.command.id, f"the unit did not answer within {limit_s:g} s")
+        return Outcome("unanswered", f"the unit did not answer within {limit_s:g} s")
 
 
 @dataclass
@@ -121,6 +127,7 @@ class Session:
     captured_at_ns: int | None = None
     captures_ns: deque[int] = field(default_factory=lambda: deque(maxlen=FPS_FRAMES))
     health: Health = field(default_factory=Health)
+    contract_minor: int | None = None
 
     def take_in(self, update: UpdateRequest, now_ns: int) -> None:
         """The unit's newest update, which arrived at `now_ns`."""
@@ -199,9 +206,15 @@ class Slot:
         self.T_world_camera, self.pose_version = record.T_world_camera, record.pose_version
         self.warning = _pose_warning(record, self.session.told_pose)
 
-    def begin_session(self, told_pose: Matrix | None) -> None:
+    def begin_session(self, told_pose: Matrix | None, contract_minor: int | None = None) -> None:
         """The unit registered; whatever it said before is void."""
-        self.session = Session(told_pose, registered=True, phase="fetching", versions=self.session.versions)
+        self.session = Session(
+            told_pose,
+            registered=True,
+            phase="fetching",
+            versions=self.session.versions,
+            contract_minor=contract_minor,
+        )
         self.warning = _pose_warning(self.record, told_pose)
 
     @property
@@ -217,36 +230,39 @@ class Slot:
     def expire(self, now_ns: int) -> None:
         """Give up what the unit did not answer in its time."""
         for asked in self._overdue(now_ns):
-            self.end(asked.unanswered)
+            self.end(asked.command.id, asked.unanswered)
 
-    def end(self, outcome: Outcome) -> None:
+    def end(self, command_id: int, outcome: Outcome) -> None:
         """A command came to an end; harmless when it had before."""
-        for asked in [asked for asked in self.asked if asked.command.id == outcome.id]:
+        for asked in [asked for asked in self.asked if asked.command.id == command_id]:
             self.asked.remove(asked)
             if asked.on_end is not None:
                 asked.on_end(outcome)
             verb = asked.command.verb
             level = logging.DEBUG if verb == "image" else logging.INFO
-            fields = {**self.log_fields("command"), "verb": verb}
+            fields = {**self.log_fields("command"), "verb": verb, "code": outcome.code}
+            gained = f": {outcome.detail}" if outcome.code == "done" and outcome.detail else ""
             logger.log(
                 level,
-                "unit %d (%s): command %d, %s: %s",
+                "unit %d (%s): command %d, %s: %s%s",
                 self.id,
                 self.ip,
-                outcome.id,
+                command_id,
                 verb,
-                outcome.text,
+                outcome.sentence,
+                gained,
                 extra=fields,
             )
-            if self.last_command is not None and self.last_command.id == outcome.id:
-                self.last_command = self.last_command.model_copy(update={"outcome": outcome.text})
+            if self.last_command is not None and self.last_command.id == command_id:
+                self.last_command = self.last_command.ended(outcome)
 
-    def tell(self, state: State, reason: str) -> None:
+    def tell(self, state: State, cause: Reason | None) -> None:
         """Log that its state is another one."""
+        reason = sentence_of(cause)
         level = logging.INFO if state == "live" else logging.WARNING
         before = f"{self.told_state} → " if self.told_state else ""
         why = f": {reason}" if reason else ""
-        fields = {**self.log_fields("state"), "state": state, "reason": reason}
+        fields = {**self.log_fields("state"), "state": state, "reason": reason, "code": cause.code if cause else ""}
         logger.log(level, "unit %d (%s): %s%s%s", self.id, self.ip, before, state, why, extra=fields)
         self.told_state = state
 
@@ -254,32 +270,36 @@ class Slot:
         """What a line of the log about it carries besides its text."""
         return {"event": event, "unit_id": self.id, "ip": self.ip}
 
-    def judge(self, now_ns: int, current: Versions, settings: Settings) -> tuple[State, str]:
-        """The unit's state, and the reason in words when it is not live, or a warning when it is.
+    def judge(self, now_ns: int, current: Versions, settings: Settings) -> tuple[State, Reason | None]:
+        """The unit's state, and the reason when it is not live, or a warning when it is.
 
         `current` has the versions of the master; its pose counts for nothing, each slot has its own.
         """
         if self.T_world_camera is None:
-            return "uncalibrated", self.record.note or self.session.health.trouble or "its pose is not known yet"
+            return "uncalibrated", self._without_pose()
         if stale := self._stale(now_ns, current, settings):
-            trouble = f" ({self.session.health.trouble})" if self.session.health.trouble else ""
-            return "stale", stale + trouble
+            return "stale", self._with_trouble(stale)
         health = self.session.health
         if health.trouble:
-            return "blind", health.trouble
+            return "blind", self._trouble(health.trouble)
         if health.blind:
-            return "blind", health.blind
+            return "blind", Reason("covered", health.blind)
         if health.valid_share < BLIND_VALID_SHARE:
-            return "blind", f"only {health.valid_share:.0%} of its pixels measure anything"
+            numbers = {"valid_share": health.valid_share, "limit_share": BLIND_VALID_SHARE}
+            text = f"only {health.valid_share:.0%} of its pixels measure anything"
+            return "blind", Reason("few_pixels", text, numbers)
         if health.moved:
-            return "moved", health.moved
+            return "moved", Reason("moved", health.moved)
         if health.static_share >= MOVED_STATIC_SHARE and health.agreeing_share < MOVED_AGREEING_SHARE:
-            return "moved", f"only {health.agreeing_share:.0%} of the known surfaces are where they should be"
+            numbers = {"agreeing_share": health.agreeing_share, "limit_share": MOVED_AGREEING_SHARE}
+            text = f"only {health.agreeing_share:.0%} of the known surfaces are where they should be"
+            return "moved", Reason("few_surfaces", text, numbers)
         if self.warning:
-            return "live", f"{self.warning}; {health.warning}" if health.warning else self.warning
-        return "live", health.warning or ""
+            text = f"{self.warning}; {health.warning}" if health.warning else self.warning
+            return "live", Reason("pose_differs", text)
+        return "live", Reason("warning", health.warning) if health.warning else None
 
-    def row(self, now_ns: int, state: State, reason: str, voxels: int, range_m: float | None) -> UnitRow:
+    def row(self, now_ns: int, state: State, cause: Reason | None, voxels: int, range_m: float | None) -> UnitRow:
         """What `GET /units` tells."""
         session = self.session
         age_s, arrival_age_s = session.age_s(now_ns), session.arrival_age_s(now_ns)
@@ -291,7 +311,8 @@ class Slot:
             model=self.record.model,
             software=self.record.software,
             state=state,
-            reason=reason,
+            reason=sentence_of(cause),
+            cause=cause,
             phase=session.phase,
             age_s=None if age_s is None else round(age_s, 4),
             arrival_age_s=None if arrival_age_s is None else round(arrival_age_s, 4),
@@ -307,6 +328,7 @@ class Slot:
             intrinsics=self.record.intrinsics,
             range_m=range_m,
             versions=session.versions,
+            contract_minor=session.contract_minor,
             last_command=self._last_command(now_ns),
         )
 
@@ -315,39 +337,71 @@ class Slot:
         last = self.last_command
         for asked in self._overdue(now_ns):
             if last is not None and last.id == asked.command.id:
-                return last.model_copy(update={"outcome": asked.unanswered.text})
+                return last.ended(asked.unanswered)
         return last
 
     def _overdue(self, now_ns: int) -> list[_Asked]:
         return [asked for asked in self.asked if asked.expires_at_ns <= now_ns]
 
-    def _stale(self, now_ns: int, current: Versions, settings: Settings) -> str:
-        """Why its last view says nothing about now; empty when it does."""
+    def _without_pose(self) -> Reason:
+        """Why it is not known where its camera is."""
+        if self.record.note:
+            is_old = self.session.health.trouble_code == "contract"
+            return Reason("contract" if is_old else "pose_void", self.record.note)
+        if self.session.health.trouble:
+            return self._trouble(self.session.health.trouble)
+        return Reason("no_pose", "its pose is not known yet")
+
+    def _trouble(self, sentence: str) -> Reason:
+        """What the unit says is wrong, and how far it is with what is to be waited for."""
+        progress = self.session.health.progress
+        numbers = {"done": float(progress.done), "total": float(progress.total)} if progress else {}
+        return Reason(self.session.health.trouble_code or "trouble", sentence, numbers)
+
+    def _with_trouble(self, stale: Reason) -> Reason:
+        """The same with what the unit said was wrong; one that does not understand its master is not merely late."""
+        trouble = self.session.health.trouble
+        if not trouble:
+            return stale
+        is_old = self.session.health.trouble_code == "contract" and stale.code not in SILENT
+        return Reason("contract" if is_old else stale.code, f"{stale.sentence} ({trouble})", stale.numbers)
+
+    def _stale(self, now_ns: int, current: Versions, settings: Settings) -> Reason | None:
+        """Why its last view says nothing about now; None when it does."""
         limit_s = settings.stale_after_s
         session = self.session
         arrival_age_s, age_s = session.arrival_age_s(now_ns), session.age_s(now_ns)
         uncertainty_ns = session.clock_uncertainty_ns(now_ns)
         if arrival_age_s is None:
-            return "no update since it registered" if session.registered else "no update since the master started"
+            since = "it registered" if session.registered else "the master started"
+            return Reason("no_update", f"no update since {since}")
         if arrival_age_s > limit_s:
-            return f"its last update came {arrival_age_s:.1f} s ago, at most {limit_s:g} s are trusted"
+            text = f"its last update came {arrival_age_s:.1f} s ago, at most {limit_s:g} s are trusted"
+            return Reason("late_update", text, {"age_s": round(arrival_age_s, 1), "limit_s": limit_s})
         if session.captured_at_ns is None:
-            return "no frame yet"
+            return Reason("no_frame", "no frame yet")
         if age_s is None or uncertainty_ns is None:
-            return "its clock is not known yet"
+            return Reason("clock_unknown", "its clock is not known yet")
         if uncertainty_ns > limit_s * NS_PER_S:
-            return f"its clock is known to {uncertainty_ns / NS_PER_S:.1f} s only"
+            text = f"its clock is known to {uncertainty_ns / NS_PER_S:.1f} s only"
+            numbers = {"uncertainty_s": round(uncertainty_ns / NS_PER_S, 1), "limit_s": limit_s}
+            return Reason("clock_uncertain", text, numbers)
         if age_s > limit_s:
-            return f"its last frame is {age_s:.1f} s old, at most {limit_s:g} s are trusted"
+            text = f"its last frame is {age_s:.1f} s old, at most {limit_s:g} s are trusted"
+            return Reason("late_frame", text, {"age_s": round(age_s, 1), "limit_s": limit_s})
         if age_s * NS_PER_S < -(uncertainty_ns + FUTURE_TOLERANCE_NS):
-            return f"its last frame seems to be of {-age_s:.3f} s from now: its clock jumped"
+            text = f"its last frame seems to be of {-age_s:.3f} s from now: its clock jumped"
+            return Reason("clock_jumped", text, {"ahead_s": round(-age_s, 3)})
         if session.versions.lattice != current.lattice:
-            return "it does not work on the current lattice yet"
+            text = "it does not work on the current lattice yet"
+            return _behind("old_lattice", text, session.versions.lattice, current.lattice)
         if session.versions.cell != current.cell:
-            return "it does not work with the current cell yet"
+            text = "it does not work with the current cell yet"
+            return _behind("old_cell", text, session.versions.cell, current.cell)
         if session.versions.pose != self.pose_version:
-            return "it does not work with its current pose yet"
-        return ""
+            text = "it does not work with its current pose yet"
+            return _behind("old_pose", text, session.versions.pose, self.pose_version)
+        return None
 
 
 class Registry:
@@ -423,7 +477,7 @@ class Registry:
         elif slot.serial != record.serial:
             logger.warning("unit %d (%s): %s", slot.id, ip, record.note, extra=slot.log_fields("camera"))
         slot.become(record)
-        slot.begin_session(request.T_world_camera)
+        slot.begin_session(request.T_world_camera, request.contract_minor)
         if slot.warning:
             logger.warning("unit %d (%s): %s", slot.id, ip, slot.warning, extra=slot.log_fields("pose"))
         return slot, elsewhere
@@ -499,6 +553,16 @@ class Registry:
 
     def _drop(self, slot: Slot) -> None:
         del self._slots[slot.id], self._by_ip[slot.ip]
+
+
+def sentence_of(cause: Reason | None) -> str:
+    """A reason in words; empty where there is none."""
+    return "" if cause is None else cause.sentence
+
+
+def _behind(code: ReasonCode, sentence: str, version: int, current: int) -> Reason:
+    """A unit that works with a version that is not the current one."""
+    return Reason(code, sentence, {"version": float(version), "current": float(current)})
 
 
 def _registered(request: InitializeRequest, ip: str, before: UnitRecord | int, elsewhere: Iterable[Slot]) -> UnitRecord:

@@ -354,7 +354,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> None:
     if version > SCHEMA_VERSION:
         raise ConfigError(
             f"{path}: expected a store of version {SCHEMA_VERSION}, got version {version}: it was written by a newer "
-            "master-server; install that again, or use another --state-dir"
+            "master-server; install that again, put back the copy of before the update, or use another --state-dir"
         )
     # A page that was cut short is filled up in silence; while there is a log it has the page as a whole.
     log = path.with_name(path.name + "-wal")

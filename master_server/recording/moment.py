@@ -24,7 +24,7 @@ from master_server.core import MapView, Master
 from shared.cell import Cell
 from shared.errors import InputError
 from shared.lattice import Lattice
-from shared.messages import CellReference, Counter, LatticeDescription, Nanoseconds, RobotAnswer, UnitRow
+from shared.messages import CellReference, Counter, LatticeDescription, Nanoseconds, Reason, RobotAnswer, UnitRow
 from shared.settings import Settings
 
 FORMAT = 1
@@ -85,7 +85,10 @@ class Record(BaseModel):
 
 
 class StateRecord(Record):
-    """What changes with time alone: ages, states, reasons. `at_ns` is by the master's clock."""
+    """What changes with time alone: ages, states, reasons. `at_ns` is by the master's clock.
+
+    `causes` are the reasons for programs; older recordings have none.
+    """
 
     at_ns: Nanoseconds
     complete: bool
@@ -96,6 +99,7 @@ class StateRecord(Record):
     units: tuple[UnitRow, ...]
     robot: RobotAnswer
     cell: CellReference
+    causes: tuple[Reason, ...] = ()
 
     @classmethod
     def of(cls, moment: Moment) -> StateRecord:
@@ -111,6 +115,7 @@ class StateRecord(Record):
             units=moment.units,
             robot=moment.robot,
             cell=moment.reference,
+            causes=view.causes,
         )
 
 

@@ -253,6 +253,7 @@ class Recording:
                 state.oldest_view_age_s,
                 state.units_live,
                 merged.reported(),
+                state.causes,
             )
             settings = _checked(Settings, raw.settings)
             return Frame(raw.log_ns, state, view, seen.blocks.lattice(), seen.counts(), settings)

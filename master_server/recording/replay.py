@@ -106,7 +106,10 @@ class Replay:
 
     def unit_states(self, now_ns: int) -> list[UnitState]:
         """Of each row what a stream tells."""
-        return [UnitState(row.id, row.ip, row.state, row.reason, row.age_s, row.voxels) for row in self.units(now_ns)]
+        return [
+            UnitState(row.id, row.ip, row.state, row.reason, row.cause, row.age_s, row.voxels)
+            for row in self.units(now_ns)
+        ]
 
     def robot_answer(self, since_ns: int | None, now_ns: int) -> RobotAnswer:
         """The newest joints, or all after `since_ns`, by the clock of the recording."""

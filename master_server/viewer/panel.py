@@ -6,7 +6,6 @@ from __future__ import annotations
 import html
 import io
 import json
-import re
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -37,7 +36,7 @@ from master_server.viewer.scene import (
 from master_server.viewer.sessions import Viewer
 from shared.clock import NS_PER_S
 from shared.errors import CellwatchError, Refusal
-from shared.messages import UnitRow
+from shared.messages import Progress, UnitRow
 from shared.settings import Settings
 
 ACTION_S = 5.0
@@ -92,9 +91,6 @@ COMMANDS = (
 COLOURINGS = BY_WITNESSES, BY_UNIT = "number of units", "unit"
 """What the colours of voxels may tell."""
 
-LEARNING = re.compile(r"learning the background: frame (\d+) of (\d+)")
-"""What a unit says while it learns, as its reason not to be live."""
-
 
 def status_html(told: Look) -> str:
     """Whether the map is all there is, and why not."""
@@ -145,9 +141,10 @@ def table_html(rows: Sequence[UnitRow]) -> str:
         parts.append(f"<tr {data}>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
         notes = [row.reason] if row.reason else []
         if command := row.last_command:
-            notes.append(f"{command.verb}: {command.outcome or 'under way'}")
+            detail = f": {command.detail}" if command.code == "done" and command.detail else ""
+            notes.append(f"{command.verb}: {command.outcome or 'under way'}{detail}")
         if notes:
-            bar = _progress_html(row.reason)
+            bar = _progress_html(row.health.progress)
             parts.append(f'<tr><td class="why" colspan="8">{html.escape("; ".join(notes))}{bar}</td></tr>')
     if not rows:
         parts.append('<tr><td class="why" colspan="8">No unit has registered yet.</td></tr>')
@@ -182,12 +179,11 @@ def _of_files(count: int) -> str:
     return f" in {count} files" if count > 1 else ""
 
 
-def _progress_html(reason: str) -> str:
-    """How far a unit is that learns; empty for all others."""
-    found = LEARNING.search(reason)
-    if found is None:
+def _progress_html(progress: Progress | None) -> str:
+    """How far a unit has come with what is to be waited for; empty where it tells nothing of the kind."""
+    if progress is None:
         return ""
-    return f'<progress value="{int(found[1])}" max="{int(found[2])}"></progress>'
+    return f'<progress value="{progress.done}" max="{progress.total}"></progress>'
 
 
 def _css(state: str) -> str:

@@ -15,6 +15,7 @@ from shared.cell import Cell
 from shared.kinematics import DHJoint, Robot
 from shared.meshes import box_mesh
 from shared.messages import (
+    CONTRACT_MINOR,
     CONTRACT_VERSION,
     Health,
     InitializeAnswer,
@@ -125,6 +126,7 @@ class FakeUnit:
         """Who it is."""
         return InitializeRequest(
             contract=contract,
+            contract_minor=CONTRACT_MINOR,
             serial=self.serial,
             model="fake",
             intrinsics=Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0),

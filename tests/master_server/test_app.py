@@ -411,6 +411,8 @@ async def test_commands_of_an_operator_reach_the_unit(desk: Desk, method: str, w
         "id": asked.json()["id"],
         "verb": verb,
         "outcome": None,
+        "code": None,
+        "detail": "",
     }
 
 

@@ -6,7 +6,7 @@ import sys
 import zlib
 from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import msgpack
 import numpy as np
@@ -20,13 +20,17 @@ from shared.messages import (
     MAX_SEEN_BYTES,
     MAX_VOXELS,
     Command,
+    Ended,
     Health,
     InitializeRequest,
     JointSample,
     LatticeDescription,
     Outcome,
+    OutcomeCode,
+    Progress,
     RobotAnswer,
     SeenReport,
+    TroubleCode,
     UpdateAnswer,
     UpdateRequest,
     Versions,
@@ -66,7 +70,7 @@ def update(**changes: Any) -> UpdateRequest:
             valid_share=0.87, agreeing_share=0.95, residual_share=-0.01, static_share=0.5, process_ms=8.1, frame=10**7
         ),
         "joints_until_ns": LATE_NS,
-        "done": (Outcome(3, DONE), Outcome(4, "the board is not in view")),
+        "done": (Ended.of(3, DONE), Ended.of(4, Outcome("failed", "the board is not in view"))),
     }
     return UpdateRequest(**{**fields, **changes})
 
@@ -104,7 +108,7 @@ def test_the_names_on_the_wire_are_those_of_the_contract() -> None:
         "joints_until_ns", "done",
     ]  # fmt: skip
     assert fields["versions"] == [1000, 1000, 1000, 1000]
-    assert fields["health"] == [0.87, 0.95, -0.01, 0.5, 8.1, 10**7, None, None, None, None]
+    assert fields["health"] == [0.87, 0.95, -0.01, 0.5, 8.1, 10**7, *[None] * 6]
     assert fields["keys"][:8] == b"\x05\x00\x00\x00\x06\x00\x00\x00"
 
 
@@ -211,7 +215,11 @@ def test_bad_seen_reports_are_refused(shape: tuple[int, int, int], bits: bytes) 
         ({"health": [float("nan"), 0.5, 0.0, 0.5, 1.0, 1, None, None, None, None]}, "health.valid_share"),
         ({"health": [1.1, 0.5, 0.0, 0.5, 1.0, 1, None, None, None, None]}, "health.valid_share"),
         ({"health": [0.5, 0.5, 0.0, 0.5, 1.0, 1, "x" * 201, None, None, None]}, "health.trouble"),
-        ({"health": [0.5] * 9}, "health: expected an array of 10 values"),
+        ({"health": [0.5, 0.5, 0.0, 0.5, 1.0, 1, *[None] * 7]}, "health: expected an array of 10 to 12 values"),
+        ({"health": [0.5, 0.5, 0.0, 0.5, 1.0, 1, *[None] * 4, "bored"]}, "health.trouble_code"),
+        ({"health": [0.5, 0.5, 0.0, 0.5, 1.0, 1, *[None] * 5, ["background", 1]]}, "health.progress.total"),
+        ({"health": [0.5, 0.5, 0.0, 0.5, 1.0, 1, *[None] * 5, ["background", 1, 2, 3]]}, "health: expected a progress"),
+        ({"health": [0.5] * 9}, "health: expected an array of 10"),
         ({"seen": {"block_size_m": 0.1, "shape": [1, 1, 0], "bits": b""}}, "seen.shape"),
         ({"seen": {"block_size_m": 0.1, "shape": [1, 1, 1], "bits": b"x" * (MAX_SEEN_BYTES + 1)}}, "seen.bits"),
         ({"done": list(range(17))}, "done"),
@@ -307,6 +315,15 @@ COUNTS = st.integers(0, 2**63 - 1)
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False, width=32)
 VERSIONS = st.builds(Versions, settings=COUNTS, lattice=COUNTS, cell=COUNTS, pose=COUNTS)
 TEXTS = st.text(st.characters(exclude_categories=("Cs",)), max_size=200)
+OUTCOMES = (None, *get_args(OutcomeCode))
+HEALTH = st.builds(
+    Health,
+    valid_share=st.floats(0.0, 1.0),
+    frame=COUNTS,
+    trouble=st.none() | TEXTS,
+    trouble_code=st.sampled_from((None, *get_args(TroubleCode))),
+    progress=st.none() | st.builds(Progress, task=st.just("background"), done=COUNTS, total=COUNTS),
+)
 UPDATES = st.builds(
     UpdateRequest,
     id=COUNTS,
@@ -317,9 +334,16 @@ UPDATES = st.builds(
     exchange=st.none() | st.builds(Exchange, TIMES, TIMES, TIMES, TIMES),
     versions=VERSIONS,
     keys=st.binary(max_size=80),
-    health=st.builds(Health, valid_share=st.floats(0.0, 1.0), frame=COUNTS, trouble=st.none() | TEXTS),
+    health=st.builds(
+        Health,
+        valid_share=st.floats(0.0, 1.0),
+        frame=COUNTS,
+        trouble=st.none() | TEXTS,
+        trouble_code=st.sampled_from((None, *get_args(TroubleCode))),
+        progress=st.none() | st.builds(Progress, task=st.just("background"), done=COUNTS, total=COUNTS),
+    ),
     joints_until_ns=TIMES,
-    done=st.lists(st.builds(Outcome, COUNTS, TEXTS), max_size=3).map(tuple),
+    done=st.lists(st.builds(Ended, COUNTS, TEXTS, st.sampled_from(OUTCOMES)), max_size=3).map(tuple),
 )
 SAMPLES = st.builds(
     JointSample,

@@ -13,7 +13,7 @@ import pytest
 from edge_unit.uplink.client import MasterClient
 from shared.camera import Intrinsics
 from shared.clock import monotonic_ns
-from shared.messages import CONTRACT_VERSION, Health, InitializeRequest, UpdateRequest
+from shared.messages import CONTRACT_MINOR, CONTRACT_VERSION, Health, InitializeRequest, UpdateRequest
 from shared.timebase import Exchange
 from shared.wire import keys_to_bytes
 from tests.system.cluster import Cluster, write_cell
@@ -55,6 +55,7 @@ async def test_an_update_and_its_answer_cost_at_most_4_bytes_a_voxel_and_800(tmp
             slot = await client.initialize(
                 InitializeRequest(
                     contract=CONTRACT_VERSION,
+                    contract_minor=CONTRACT_MINOR,
                     serial="A",
                     intrinsics=Intrinsics(8, 6, 10.0, 10.0, 4.0, 3.0),
                     sent_at_ns=monotonic_ns(),

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Path, Request
+from fastapi import APIRouter, Depends, Path, Request, Response
 
 from master_server.api.routes.common import (
     OPERATOR_ONLY,
@@ -27,10 +27,13 @@ router = APIRouter(tags=["units"], route_class=Negotiated)
 UnitId = Annotated[int, Path(ge=0, lt=2**31, description="Of `GET /units`.")]
 
 
-@router.post("/initialize", dependencies=UNIT_ONLY)
-async def initialize(body: InitializeRequest, request: Request, master: MasterDependency) -> InitializeAnswer:
+@router.post("/initialize", dependencies=UNIT_ONLY, response_model=InitializeAnswer)
+async def initialize(body: InitializeRequest, request: Request, master: MasterDependency) -> Response:
     """A unit asks for its slot; the same IP keeps the same id."""
-    return master.initialize(body, ip_of(request.scope), monotonic_ns())
+    answer = master.initialize(body, ip_of(request.scope), monotonic_ns())
+    # A unit of contract 5.0 refuses a name that it does not know.
+    unknown = set() if body.contract_minor else {"contract_minor"}
+    return Response(answer.model_dump_json(exclude=unknown), media_type="application/json")
 
 
 @router.get("/units", dependencies=READERS)

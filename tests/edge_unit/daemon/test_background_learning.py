@@ -12,9 +12,10 @@ from edge_unit.daemon.background_learning import Learning
 from edge_unit.daemon.background_store import BackgroundStore, Place
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.sources.frame import CameraInfo
+from edge_unit.uplink.uplink import Trouble
 from shared.camera import Intrinsics
 from shared.cell import Cell
-from shared.messages import DONE, Command
+from shared.messages import Command, Outcome, OutcomeCode, Progress
 from shared.transforms import look_at
 
 CAMERA = Intrinsics(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -28,12 +29,17 @@ class Student:
     """One unit's learning, and what became of its commands."""
 
     def __init__(self, folder: Path, frames: int | None = None) -> None:
-        self.told: list[tuple[int, str]] = []
+        self.told: list[tuple[int, OutcomeCode]] = []
+        self.details: list[str] = []
         self.pipeline = DepthPipeline(CAMERA, POSE, Cell("bare", np.full(3, -1.0), np.full(3, 1.0)))
         store = BackgroundStore(folder)
-        self.learning = Learning(store, frames, lambda command, outcome: self.told.append((command.id, outcome)))
+        self.learning = Learning(store, frames, self.finish)
 
-    def add(self) -> str | None:
+    def finish(self, command: Command, outcome: Outcome) -> None:
+        self.told.append((command.id, outcome.code))
+        self.details.append(outcome.detail)
+
+    def add(self) -> Trouble | None:
         return self.learning.add(self.pipeline, PLACE, DEPTH, None)
 
 
@@ -41,7 +47,10 @@ def test_what_was_learned_is_found_again_and_stays_dropped(tmp_path: Path) -> No
     one = Student(tmp_path, frames=2)
     one.learning.find(one.pipeline, PLACE)
     assert one.learning.progress == (0, 2)
-    assert one.add() == "learning the background: frame 1 of 2"
+    learning = one.add()
+    assert learning is not None
+    assert (learning.code, learning.progress) == ("background", Progress(task="background", done=1, total=2))
+    assert "frame 1 of 2" in learning.sentence
     assert one.add() is None
     assert one.learning.progress is None
     assert one.pipeline.reference is not None
@@ -51,7 +60,7 @@ def test_what_was_learned_is_found_again_and_stays_dropped(tmp_path: Path) -> No
     assert again.pipeline.reference is not None
     again.learning.drop(again.pipeline, DROP)
     assert again.pipeline.reference is None
-    assert again.told == [(2, DONE)]
+    assert again.told == [(2, "done")]
     last = Student(tmp_path)
     last.learning.find(last.pipeline, PLACE)
     assert last.pipeline.reference is None
@@ -63,7 +72,7 @@ def test_whoever_asked_is_told_what_became_of_it(tmp_path: Path) -> None:
     one.learning.begin(one.pipeline, LEARN)
     one.learning.begin(one.pipeline, LEARN)
     assert one.add() is None
-    assert one.told == [(1, "it was asked to begin anew"), (1, DONE)]
+    assert one.told == [(1, "superseded"), (1, "done")]
 
 
 def test_a_background_that_cannot_be_removed_costs_no_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,4 +83,5 @@ def test_a_background_that_cannot_be_removed_costs_no_frame(tmp_path: Path, monk
 
     monkeypatch.setattr(BackgroundStore, "drop", refuse)
     one.learning.drop(one.pipeline, DROP)
-    assert one.told == [(2, "it is used no more, but comes back with the next start: read-only file system")]
+    assert one.told == [(2, "failed")]
+    assert "read-only file system" in one.details[0]

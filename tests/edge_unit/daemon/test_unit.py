@@ -42,7 +42,7 @@ from shared.camera import Intrinsics
 from shared.cell import Board
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import SourceError
-from shared.messages import DONE, CommandRow, JointsRequest, Outcome, UnitRow, Verb
+from shared.messages import CommandRow, JointsRequest, OutcomeCode, UnitRow, Verb
 from shared.settings import Settings
 from shared.transforms import from_xyz_rpy, inverse
 from simulation.cameras.board_picture import BoardPicture
@@ -308,7 +308,9 @@ async def test_a_camera_that_fails_is_opened_again_and_its_trouble_told(
         await bench.until_state("live")
         bench.show(SourceError("unplugged"))
         row = await bench.until_state("blind")
-        assert row.reason == "camera: unplugged"
+        assert row.cause is not None
+        assert row.cause.code == "camera"
+        assert "unplugged" in row.reason
         bench.show(patch(1225))
         await bench.until_state("live")
         assert bench.source.opened == 2
@@ -478,7 +480,9 @@ async def test_the_background_is_learned_kept_and_used_again(tmp_path: Path) -> 
             bench.show(patch(1225))
         row = await bench.until(lambda: (row := bench.row()) and row.frame_number == 2 and row, "learning")
         assert row.state == "blind"
-        assert row.reason == "learning the background: frame 3 of 4"
+        assert row.cause is not None
+        assert (row.cause.code, row.cause.numbers) == ("background", {"done": 3.0, "total": 4.0})
+        assert "frame 3 of 4" in row.reason
         bench.show(patch(1225))
         await bench.until_state("live")
         assert bench.voxels() == set()
@@ -494,11 +498,11 @@ async def test_the_background_is_learned_kept_and_used_again(tmp_path: Path) -> 
         await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
         bench.show(patch(1225))
         await bench.until(bench.voxels, "no background")
-        done = CommandRow(id=command.id, verb="drop_background", outcome=DONE)
+        done = CommandRow(id=command.id, verb="drop_background", outcome="done", code="done")
         await bench.until(lambda: (row := bench.row()) and row.last_command == done, f"{command} done")
 
 
-async def outcome_of(bench: Bench, verb: Verb) -> str | None:
+async def outcome_of(bench: Bench, verb: Verb) -> CommandRow:
     """What becomes of a command that the next frame answers."""
     command = bench.master.ask(1, verb, monotonic_ns())
     await bench.until(lambda: not bench.unit.uplink.commands.empty(), f"{verb} reached the unit")
@@ -509,17 +513,20 @@ async def outcome_of(bench: Bench, verb: Verb) -> str | None:
     assert isinstance(row, UnitRow)
     assert row.last_command is not None
     assert (row.last_command.id, row.last_command.verb) == (command.id, verb)
-    return row.last_command.outcome
+    return row.last_command
 
 
 async def test_what_a_unit_cannot_do_it_says(tmp_path: Path) -> None:
     bench = await asyncio.to_thread(Bench, tmp_path, T_world_camera=None)
     async with bench.running():
         await bench.until_state("uncalibrated")
-        assert await outcome_of(bench, "drop_background") == "the pose of its camera is not known yet"
+        refused = await outcome_of(bench, "drop_background")
+        assert refused.code == "refused"
+        assert "pose" in refused.detail
+        assert refused.outcome == refused.detail
         bench.master.set_pose(1, _matrix(ABOVE), "operator", None)
         await bench.until(lambda: bench.unit.uplink.assignment.T_world_camera is not None, "the pose")
-        assert await outcome_of(bench, "drop_background") == DONE
+        assert (await outcome_of(bench, "drop_background")).code == "done"
 
 
 class RefineBench(Bench):
@@ -558,9 +565,9 @@ async def test_a_pose_is_refined_by_the_cad_on_request(tmp_path: Path) -> None:
         before = await bench.until_state("live")
         assert before.T_world_camera is not None
         told = await bench.refine()
-        assert told.outcome is not None
-        assert told.outcome.startswith("done: moved by")
-        assert "mm off in the median" in told.outcome
+        assert (told.outcome, told.code) == ("done", "done")
+        assert told.detail.startswith("moved by")
+        assert "mm off" in told.detail
         row = bench.row()
         assert row is not None
         assert row.pose_origin == "refined"
@@ -570,8 +577,8 @@ async def test_a_pose_is_refined_by_the_cad_on_request(tmp_path: Path) -> None:
         bench.show(bench.frame)
         await bench.until_state("live")
         again = await bench.refine()
-        assert again.outcome is not None
-        assert "as good as it gets" in again.outcome or again.outcome.startswith("done")
+        assert again.code in ("done", "failed")
+        assert again.detail
 
 
 async def test_a_refined_pose_keeps_what_was_learned(tmp_path: Path) -> None:
@@ -580,7 +587,7 @@ async def test_a_refined_pose_keeps_what_was_learned(tmp_path: Path) -> None:
         for _ in range(3):
             bench.show(bench.frame)
         await bench.until_state("live")
-        assert (await bench.refine()).outcome != DONE
+        assert (await bench.refine()).code == "done"
         bench.show(bench.frame)
         row = await bench.until_state("live")
         pipeline = bench.unit._assigned.pipeline
@@ -599,14 +606,14 @@ async def test_who_asked_for_a_background_is_told_when_it_is_given_up(tmp_path: 
         bench.show(patch(1225))
         row = await bench.until_state("blind")
         assert row.last_command == CommandRow(id=learn.id, verb="learn_background", outcome=None)
-        ended: list[Outcome] = []
+        ended: list[tuple[int, OutcomeCode]] = []
         with pytest.MonkeyPatch.context() as monkey:
-            monkey.setattr(Slot, "end", lambda slot, outcome: ended.append(outcome))
+            monkey.setattr(Slot, "end", lambda slot, command_id, outcome: ended.append((command_id, outcome.code)))
             bench.master.ask(1, "drop_background", monotonic_ns())
             await bench.until(lambda: not bench.unit.uplink.commands.empty(), "the other command")
             bench.show(patch(1225))
             await bench.until(lambda: ended, "both outcomes")
-        assert Outcome(learn.id, "it was asked to drop the background") in ended
+        assert (learn.id, "superseded") in ended
 
 
 async def test_frames_beyond_the_rate_are_passed_over(tmp_path: Path) -> None:
@@ -742,7 +749,7 @@ async def test_it_looks_for_the_board_when_asked_even_if_it_has_a_pose(tmp_path:
         await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
         bench.show(patch(1225))
         row = await bench.until(lambda: (row := bench.row()) and row.last_command.outcome and row, "its outcome")
-        assert row.last_command.outcome == DONE
+        assert row.last_command.code == "done"
         assert np.abs(np.array(row.T_world_camera) - ABOVE.transform()).max() < 5e-3
         source.mounted = False
         bench.master.ask(1, "calibrate", monotonic_ns())
@@ -751,7 +758,8 @@ async def test_it_looks_for_the_board_when_asked_even_if_it_has_a_pose(tmp_path:
         row = await bench.until(
             lambda: (row := bench.row()) and row.last_command.id == 2 and row.last_command.outcome and row, "2"
         )
-        assert "none of the board's 12 markers" in row.last_command.outcome
+        assert row.last_command.code == "failed"
+        assert "12 markers" in row.last_command.detail
         assert np.abs(np.array(row.T_world_camera) - ABOVE.transform()).max() < 5e-3
 
 

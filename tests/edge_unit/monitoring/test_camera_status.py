@@ -16,7 +16,7 @@ from edge_unit.sources.frame import CameraInfo
 from edge_unit.sources.realsense.source import RealsenseSourceConfig
 from shared.camera import Intrinsics
 from shared.errors import SourceError
-from shared.messages import MAX_TEXT
+from shared.messages import MAX_TEXT, Health
 
 CAMERA = CameraInfo("123", "D435", Intrinsics(848, 480, 424.1, 424.2, 423.9, 239.8))
 
@@ -26,7 +26,7 @@ class Told:
 
     def __init__(self) -> None:
         self.cameras: list[CameraInfo] = []
-        self.trouble: str | None = None
+        self.trouble: Any = None
 
     def set_camera(self, camera: CameraInfo, known_pose: object) -> None:
         self.cameras.append(camera)
@@ -45,8 +45,8 @@ async def test_the_one_of_before_is_missed_if_it_is_wanted(
     camera, told = standing(tmp_path, wanted)
     await camera.failed(SourceError("x" * 2 * MAX_TEXT))
     assert told.cameras == expected
-    assert told.trouble is not None
-    assert len(told.trouble) == MAX_TEXT
+    assert told.trouble.code == "camera"
+    assert len(Health(**told.trouble.facts()).trouble or "") == MAX_TEXT
 
 
 async def test_one_that_is_here_is_remembered_and_no_other_is_missed(tmp_path: Path) -> None:
@@ -56,5 +56,6 @@ async def test_one_that_is_here_is_remembered_and_no_other_is_missed(tmp_path: P
     assert await asyncio.to_thread(CameraMemory(tmp_path).load) == CAMERA
     assert not told.trouble
     await camera.failed(SourceError("unplugged"))
-    assert told.trouble == "camera: unplugged"
+    assert told.trouble.code == "camera"
+    assert "unplugged" in told.trouble.sentence
     assert told.cameras == [CAMERA]

@@ -17,7 +17,7 @@ from edge_unit.sources.frame import CameraInfo
 from edge_unit.uplink import uplink as module
 from edge_unit.uplink.cell_cache import CellCache
 from edge_unit.uplink.client import TIMEOUT, MasterClient
-from edge_unit.uplink.uplink import Delivery, Report, Uplink, seen_report
+from edge_unit.uplink.uplink import Delivery, Report, Trouble, Uplink, seen_report
 from shared.camera import Intrinsics
 from shared.cell import Cell
 from shared.clock import monotonic_ns
@@ -31,6 +31,7 @@ from shared.messages import (
     InitializeRequest,
     JointSample,
     LatticeDescription,
+    Outcome,
     RobotAnswer,
     UpdateAnswer,
     UpdateRequest,
@@ -295,14 +296,10 @@ async def test_commands_are_carried_out_once_and_told_until_the_master_knows() -
         assert bench.uplink.commands.get_nowait() == command
         assert bench.uplink.commands.empty()
         bench.master.answers = [MasterUnreachable("nobody")]
-        bench.uplink.finish(command, "no board in view")
+        bench.uplink.finish(command, Outcome("failed", "no board in view"))
         before = len(bench.master.updates)
-        await until(
-            lambda: (
-                len([update for update in bench.master.updates[before:] if update.done == ((5, "no board in view"),)])
-                >= 2
-            )
-        )
+        ended = ((5, "no board in view", "failed"),)
+        await until(lambda: len([update for update in bench.master.updates[before:] if update.done == ended]) >= 2)
         await until(lambda: bench.master.updates[-1].done == ())
 
 
@@ -335,7 +332,7 @@ async def test_what_is_seen_is_told_when_it_changes_and_until_it_is_known() -> N
 
 async def test_trouble_goes_along_with_every_report() -> None:
     async with running() as bench:
-        bench.uplink.trouble = "camera: unplugged"
+        bench.uplink.trouble = Trouble("camera", "camera: unplugged")
         await until(lambda: bench.master.updates and bench.master.updates[-1].health.trouble == "camera: unplugged")
         bench.uplink.trouble = None
         await until(lambda: bench.master.updates[-1].health.trouble is None)

@@ -16,7 +16,7 @@ from master_server.app import make_app
 from master_server.security import Access
 from master_server.security import rate_limits as limits_module
 from shared.clock import monotonic_ns
-from shared.messages import Outcome
+from shared.messages import DONE, Ended, Outcome
 from shared.wire import MEDIA_TYPE, encode_update
 from tests.master_server.api.fuzzing import mutated
 from tests.master_server.fakes import FakeUnit, master, sees_all
@@ -68,7 +68,7 @@ def corpus(unit: FakeUnit) -> list[bytes]:
         unit.request(now_ns, few.tolist()),
         unit.request(now_ns, many.tolist(), seen=sees_all(unit.master)),
         unit.request(now_ns, captured_at_ns=None, exchange=None),
-        unit.request(now_ns, done=(Outcome(1, "done"), Outcome(2, "no light"))),
+        unit.request(now_ns, done=(Ended.of(1, DONE), Ended.of(2, Outcome("failed", "no light")))),
     ]
     return [encode_update(request) for request in requests]
 

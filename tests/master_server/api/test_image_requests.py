@@ -13,7 +13,7 @@ from master_server.api import image_requests as module
 from master_server.api.image_requests import PNG_SIGNATURE
 from master_server.app import make_app
 from master_server.security import Access
-from shared.messages import MAX_IMAGE_BYTES, Command, Outcome
+from shared.messages import DONE, MAX_IMAGE_BYTES, Command, Ended, Outcome
 from shared.wire import decode_update_answer
 from tests.master_server.fakes import FakeUnit, master
 from tests.master_server.test_app import OPERATOR, UNIT, Desk
@@ -52,7 +52,7 @@ async def test_all_who_ask_share_one_picture(desk: Desk, raw: bool) -> None:
     # Nothing is kept, and it is no command of an operator's.
     assert (await put(desk, "/units/1/images/foreground", commands[0].id)).status_code == 409
     assert (await desk.call("GET", "/units")).json()[0]["last_command"] is None
-    await desk.update(unit, done=(Outcome(commands[0].id, "done"),))
+    await desk.update(unit, done=(Ended.of(commands[0].id, DONE),))
     assert decode_update_answer((await desk.update(unit)).content).commands == ()
 
 
@@ -68,7 +68,7 @@ async def test_a_picture_that_does_not_come_is_not_waited_for(desk: Desk, monkey
 async def test_why_there_is_no_picture_is_told(desk: Desk) -> None:
     unit = await desk.register()
     (waiting,), (command,) = await asked(desk, unit, "/units/1/images/expected")
-    await desk.update(unit, done=(Outcome(command.id, "the pose of its camera is not known yet"),))
+    await desk.update(unit, done=(Ended.of(command.id, Outcome("refused", "the pose of its camera is not known yet")),))
     response = await waiting
     assert response.status_code == 409
     assert response.json()["detail"] == "unit 1: no picture: the pose of its camera is not known yet"

@@ -20,11 +20,14 @@ from shared.messages import (
     DONE,
     MAX_COMMANDS,
     CommandRow,
+    Ended,
     Health,
     JointsRequest,
     Matrix,
     Outcome,
     PoseOrigin,
+    Progress,
+    UnitRow,
     Versions,
 )
 from shared.settings import Settings
@@ -159,7 +162,7 @@ def test_there_is_an_end_to_slots() -> None:
 
 def test_another_contract_is_refused() -> None:
     one = master()
-    with pytest.raises(Refusal, match=f"version {CONTRACT_VERSION}, the unit {CONTRACT_VERSION + 1}"):
+    with pytest.raises(Refusal, match=f"the unit {CONTRACT_VERSION + 1}.*update the master first"):
         one.initialize(FakeUnit(one).introduction(NOW_NS, contract=CONTRACT_VERSION + 1), "10.0.0.1", NOW_NS)
     assert one.units(NOW_NS) == []
 
@@ -275,6 +278,61 @@ def test_a_clock_that_is_known_too_badly_is_not_enough() -> None:
     unit = joined(one)
     unit.update(NOW_NS, [1], exchange=Exchange(0, NOW_NS, NOW_NS, 4 * S))
     assert state(one, unit) == ("stale", "its clock is known to 2.0 s only")
+
+
+def cause(one: Master, unit: FakeUnit, now_ns: int = NOW_NS) -> tuple[str, dict[str, float]]:
+    row = next(row for row in one.units(now_ns) if row.id == unit.initialized.id)
+    assert row.cause is not None
+    assert row.cause.sentence == row.reason
+    # As the window is told.
+    assert UnitRow.model_validate(row.model_dump(), strict=True) == row
+    return row.cause.code, row.cause.numbers
+
+
+LEARNS = Health(trouble="it learns", trouble_code="background", progress=Progress(task="background", done=3, total=60))
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "numbers"),
+    [
+        ({"exchange": None}, "clock_unknown", {}),
+        ({"captured_at_ns": None}, "no_frame", {}),
+        ({"age_ns": 700 * MS}, "late_frame", {"age_s": 0.7, "limit_s": 0.5}),
+        ({"versions": Versions(settings=1, lattice=7, cell=1, pose=1)}, "old_lattice", {"version": 7, "current": 1}),
+        ({"versions": Versions(settings=1, lattice=1, cell=7, pose=1)}, "old_cell", {"version": 7, "current": 1}),
+        ({"versions": Versions(settings=1, lattice=1, cell=1, pose=7)}, "old_pose", {"version": 7, "current": 1}),
+        ({"health": LEARNS}, "background", {"done": 3, "total": 60}),
+        ({"health": Health(trouble="of an older unit")}, "trouble", {}),
+        ({"health": GOOD.model_copy(update={"blind": "covered"})}, "covered", {}),
+        ({"health": GOOD.model_copy(update={"moved": "by 30 mm"})}, "moved", {}),
+        ({"health": GOOD.model_copy(update={"valid_share": 0.01})}, "few_pixels", {"valid_share": 0.01}),
+        ({"health": GOOD.model_copy(update={"agreeing_share": 0.02})}, "few_surfaces", {"agreeing_share": 0.02}),
+        ({"health": GOOD.model_copy(update={"warning": "USB 2"})}, "warning", {}),
+        ({"health": Health(trouble="update me", trouble_code="contract"), "captured_at_ns": None}, "contract", {}),
+    ],
+)
+def test_a_state_has_a_code_and_numbers(changes: dict[str, Any], code: str, numbers: dict[str, float]) -> None:
+    one = master()
+    unit = joined(one)
+    unit.update(NOW_NS, [1], seen=sees_all(one), **changes)
+    found, told = cause(one, unit)
+    assert found == code
+    assert told.items() >= numbers.items()
+    (row,) = one.unit_states(NOW_NS)
+    assert row.cause is not None
+    assert row.cause.code == code
+    causes = {each.code: each.numbers for each in one.view(NOW_NS).causes}
+    assert (code in causes) == (row.state != "live")
+    assert causes.get(code, {"unit": 1})["unit"] == 1
+
+
+def test_a_unit_that_is_silent_is_that_whatever_it_said() -> None:
+    one = master()
+    unit = joined(one)
+    assert cause(one, unit)[0] == "no_update"
+    unit.update(NOW_NS, health=Health(trouble="update me", trouble_code="contract"))
+    assert cause(one, unit) == ("contract", {})
+    assert cause(one, unit, LATER_NS) == ("late_update", {"age_s": 60.0, "limit_s": 0.5})
 
 
 def test_a_unit_without_a_frame_says_so() -> None:
@@ -528,10 +586,10 @@ def test_commands_are_repeated_until_they_are_done() -> None:
     assert unit.update(NOW_NS).commands == (command,)
     (row,) = one.units(NOW_NS)
     assert row.last_command == CommandRow(id=command.id, verb="learn_background", outcome=None)
-    assert unit.update(NOW_NS, done=(Outcome(command.id, DONE),)).commands == ()
-    assert unit.update(NOW_NS, done=(Outcome(command.id, "too late"),)).commands == ()
+    assert unit.update(NOW_NS, done=(Ended.of(command.id, DONE),)).commands == ()
+    assert unit.update(NOW_NS, done=(Ended.of(command.id, Outcome("failed", "too late")),)).commands == ()
     (row,) = one.units(NOW_NS)
-    assert row.last_command == CommandRow(id=command.id, verb="learn_background", outcome=DONE)
+    assert row.last_command == CommandRow(id=command.id, verb="learn_background", outcome="done", code="done")
 
 
 def test_who_asks_changes_and_logs_nothing(caplog: pytest.LogCaptureFixture) -> None:

@@ -26,13 +26,16 @@ def test_without_a_time_joints_are_of_their_arrival() -> None:
 
 def test_states() -> None:
     robot = RobotJoints(NAMES)
-    assert robot.state(S, 0.5) == ("silent", "the robot has not reported its joints yet")
+    state, cause = robot.state(S, 0.5)
+    assert cause is not None
+    assert (state, cause.code, cause.numbers) == ("silent", "robot_silent", {})
     put(robot, S)
-    assert robot.state(S + 500 * MS, 0.5) == ("fresh", "")
-    state, reason = robot.state(S + 501 * MS, 0.5)
-    assert state == "stale"
-    assert "0.5 s" in reason
-    assert RobotJoints(None).state(S, 0.5) == ("none", "")
+    assert robot.state(S + 500 * MS, 0.5) == ("fresh", None)
+    state, cause = robot.state(S + 501 * MS, 0.5)
+    assert cause is not None
+    assert (state, cause.code, cause.numbers) == ("stale", "robot_stale", {"age_s": 0.5, "limit_s": 0.5})
+    assert "0.5 s" in cause.sentence
+    assert RobotJoints(None).state(S, 0.5) == ("none", None)
 
 
 @pytest.mark.parametrize(

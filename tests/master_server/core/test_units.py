@@ -15,7 +15,7 @@ from master_server.core import units as registry_module
 from master_server.persistence import Store
 from shared.camera import Intrinsics
 from shared.errors import Refusal
-from shared.messages import CONTRACT_VERSION, InitializeRequest
+from shared.messages import CONTRACT_MINOR, CONTRACT_VERSION, InitializeRequest
 from tests.master_server.fakes import AT_ORIGIN, START_NS, S
 
 MAX_UNITS = 4
@@ -57,7 +57,8 @@ class RegistryMachine(RuleBasedStateMachine):
     @rule(ip=st.sampled_from(IPS), serial=st.sampled_from(SERIALS), boot=st.sampled_from("xy"))
     def initialize(self, ip: str, serial: str, boot: str) -> None:
         request = InitializeRequest(
-            contract=CONTRACT_VERSION, serial=serial, intrinsics=Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0),
+            contract=CONTRACT_VERSION, contract_minor=CONTRACT_MINOR,
+            serial=serial, intrinsics=Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0),
             boot_id=boot, sent_at_ns=self.now_ns,
         )  # fmt: skip
         here = self.twin.get(ip)

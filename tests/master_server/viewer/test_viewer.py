@@ -55,7 +55,7 @@ from master_server.viewer.window import voxels_of
 from shared.camera import Intrinsics
 from shared.errors import Refusal, WireError
 from shared.lattice import Lattice
-from shared.messages import CommandRow, UnitRow
+from shared.messages import CommandRow, Health, Progress, UnitRow
 from tests.master_server.fakes import START_NS, S, joined, master, sees_all
 
 UNIT, OPERATOR = b"u" * 32, b"o" * 32
@@ -283,9 +283,10 @@ def test_a_view_is_that_of_its_own_camera() -> None:
 def test_who_learns_shows_how_far_it_is() -> None:
     watched = master()
     joined(watched)
-    learning = row(watched, state="blind", reason="learning the background: frame 12 of 60")
-    assert '<progress value="12" max="60"></progress>' in table_html([learning])
-    assert "<progress" not in table_html([row(watched, reason="frame 12 of 60")])
+    health = Health(progress=Progress(task="background", done=12, total=60))
+    assert '<progress value="12" max="60"></progress>' in table_html([row(watched, reason="learns", health=health)])
+    # A unit of contract 5.0, or a recording of one, tells it to people only.
+    assert "<progress" not in table_html([row(watched, reason="learning the background: frame 12 of 60")])
 
 
 async def test_the_last_minutes_are_there_for_who_asks() -> None:

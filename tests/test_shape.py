@@ -21,11 +21,8 @@ PARAMETERS_MAX = 10
 
 ALLOWED = {
     "edge_unit/config.py: UnitConfig": "one attribute for each name that may stand in a unit's configuration",
-    "edge_unit/daemon/unit.py: Unit": "not split yet",
-    "edge_unit/pipeline/voxelizer.py: Voxelizer": "buffers of its kernels, made once for all frames",
     "edge_unit/sources/realsense/capture_link.py: Opened": "what one process tells another once, field by field",
     "edge_unit/sources/realsense/capture_supervisor.py: CaptureSupervisor": "one process: its session and frames",
-    "edge_unit/uplink/uplink.py: Uplink": "not split yet",
 }
 """`file: name` of what is larger, and why."""
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from benchmarks.paper_experiment.scene import CAMERAS, Views
 from edge_unit.pipeline import DepthPipeline
-from edge_unit.uplink.uplink import seen_report
+from edge_unit.uplink.assignment import seen_report
 from master_server.core import MergedMap
 from shared.clock import NS_PER_MS, stage_ns
 from shared.messages import Health, SeenReport

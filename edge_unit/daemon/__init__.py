@@ -13,7 +13,9 @@ It is the last room, so nothing imports from it but the command line. In the ord
     pipeline_manager     the pipeline as the master's latest assignment has it
     refinement_task      the pose refined while frames come
     frame_processor      all that is done with one frame
+    frame_limiter        frames beyond `fps_max` are passed over
     calibration_task     the pose by the board, found and told to the master
     image_requests       the images that people ask for
+    unit_status          how a unit fares, in one line
     unit                 the daemon: source, pipeline and uplink held together
 """

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from edge_unit.daemon.background_store import BackgroundStore, Place
 from edge_unit.joints import JointEstimate
 from edge_unit.pipeline import DepthPipeline, ReferenceLearner
-from edge_unit.uplink.uplink import Trouble
+from edge_unit.uplink.assignment import Trouble
 from shared.messages import DONE, Command, Outcome, Progress
 
 logger = logging.getLogger(__name__)

@@ -9,7 +9,8 @@ from edge_unit.calibration.board_layout import require_board
 from edge_unit.calibration.board_scan import BoardSearch
 from edge_unit.daemon.report import troubled
 from edge_unit.sources.frame import DepthFrame
-from edge_unit.uplink.uplink import Assignment, Trouble, Uplink
+from edge_unit.uplink.assignment import Assignment, Trouble
+from edge_unit.uplink.uplink import Uplink
 from shared.errors import CellwatchError
 from shared.messages import DONE, Outcome, PoseQuality
 

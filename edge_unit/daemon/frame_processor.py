@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Coroutine, Iterable, Iterator
+from typing import Any
 
 from edge_unit.daemon.background_learning import Learning
 from edge_unit.daemon.joint_lookup import FrameJoints, known
@@ -15,7 +17,7 @@ from edge_unit.joints import JointEstimate
 from edge_unit.monitoring import Stages, Stance
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.sources.frame import DepthFrame
-from edge_unit.uplink.uplink import Assignment, Report, Trouble
+from edge_unit.uplink.assignment import Assignment, Report, Trouble
 from shared.errors import InputError
 from shared.messages import Command, Outcome
 from shared.transforms import Transform
@@ -25,7 +27,13 @@ logger = logging.getLogger(__name__)
 
 
 class FrameWork:
-    """From a frame to its report. Not for use from several threads at once."""
+    """From a frame to its report. Not for use from several threads at once.
+
+    Attributes:
+        assigned: the pipeline as the master's latest assignment has it.
+        learning: the background model, and what is being learned.
+        joints: where the robot was at a frame's time.
+    """
 
     def __init__(
         self,
@@ -38,11 +46,11 @@ class FrameWork:
     ) -> None:
         """`finish` is told what became of a command."""
         self._finish = finish
-        self._assigned = assigned
-        self._learning = learning
+        self.assigned = assigned
+        self.learning = learning
         self._refining = refining
         self._stance = stance
-        self._joints = joints
+        self.joints = joints
 
     def process(
         self,
@@ -56,7 +64,7 @@ class FrameWork:
         """What `frame` shows with all that was assigned and asked for; what cannot be done is the report's trouble."""
         try:
             pipeline = self._prepare(assignment, T_world_camera, changes)
-            untold = self._learning.add(pipeline, self._assigned.place, frame.depth, joints)
+            untold = self.learning.add(pipeline, self.assigned.place, frame.depth, joints)
             if untold is not None:
                 return troubled(assignment, frame, untold)
             return self._report(pipeline, assignment, frame, joints, stages)
@@ -67,7 +75,7 @@ class FrameWork:
     def _prepare(self, assignment: Assignment, T_world_camera: Transform, changes: Iterable[Command]) -> DepthPipeline:
         """The pipeline as assignment and commands have it; without one, nothing can be changed."""
         try:
-            pipeline = self._assigned.prepare(assignment, T_world_camera)
+            pipeline = self.assigned.prepare(assignment, T_world_camera)
         except InputError as error:
             for command in changes:
                 self._finish(command, Outcome("refused", str(error)))
@@ -79,9 +87,9 @@ class FrameWork:
     def _obey(self, command: Command, pipeline: DepthPipeline) -> None:
         """Do what was asked; what takes more than one frame only begins here."""
         if command.verb == "learn_background":
-            self._learning.begin(pipeline, command)
+            self.learning.begin(pipeline, command)
         elif command.verb == "drop_background":
-            self._learning.drop(pipeline, command)
+            self.learning.drop(pipeline, command)
         elif command.verb == "refine":
             self._refining.begin(pipeline, command)
         else:
@@ -103,9 +111,24 @@ class FrameWork:
         stages.end("check", parts_of(result.times))
         voxels, seen, crowd = within_bounds(result, pipeline.T_world_camera)
         stance = self._stance.watch(result.misfit, pipeline.static_version, frame.captured_at_ns)
-        warning = stance.warning or self._joints.warning(assignment.settings.joint_delay_s) or crowd
+        warning = stance.warning or self.joints.warning(assignment.settings.joint_delay_s) or crowd
         health = health_of(result, frame, stance, warning)
         self._refining.gather(pipeline, frame.depth, joints)
         keys = keys_to_bytes(voxels.keys)
         stages.end("report")
         return Report(assignment, frame.captured_at_ns, keys, seen, health, stages.took_ns)
+
+    def afterwards(
+        self, frame: DepthFrame, joints: JointEstimate | None, report: Report
+    ) -> Iterator[Coroutine[Any, Any, None]]:
+        """Yield what is to be done beside the frames that follow one that was processed; for the event loop."""
+        pipeline = self.assigned.pipeline
+        if pipeline is not None and joints is not None and report.health.trouble is None:
+            look = self.joints.watch_delay(pipeline, frame)
+            if look is not None:
+                yield asyncio.to_thread(look)
+        if self._stance.unsaved:
+            yield asyncio.to_thread(self._stance.save)
+        gathered = self._refining.take()
+        if gathered is not None:
+            yield self._refining.refine(gathered)

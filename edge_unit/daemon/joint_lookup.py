@@ -12,7 +12,8 @@ from edge_unit.joints import DelayWatch, JointEstimate
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.pipeline.moving_model import EXACT
 from edge_unit.sources.frame import DepthFrame
-from edge_unit.uplink.uplink import Assignment, Uplink
+from edge_unit.uplink.assignment import Assignment
+from edge_unit.uplink.uplink import Uplink
 from shared.clock import NS_PER_S
 
 

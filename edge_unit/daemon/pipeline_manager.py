@@ -11,7 +11,7 @@ from edge_unit.daemon.warm_up import warm_up
 from edge_unit.monitoring import Stance, place_of
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.sources.frame import CameraInfo
-from edge_unit.uplink.uplink import Assignment
+from edge_unit.uplink.assignment import Assignment
 from shared.settings import FilterSettings
 from shared.transforms import Transform
 

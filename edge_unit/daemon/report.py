@@ -6,7 +6,7 @@ from __future__ import annotations
 from edge_unit.monitoring import Verdict
 from edge_unit.pipeline import FrameResult, SeenBlocks, StageTimes, Voxels
 from edge_unit.sources.frame import DepthFrame
-from edge_unit.uplink.uplink import Assignment, Report, Trouble
+from edge_unit.uplink.assignment import Assignment, Report, Trouble
 from shared.clock import NS_PER_MS
 from shared.messages import MAX_VOXELS, Health
 from shared.transforms import Transform

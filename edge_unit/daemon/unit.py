@@ -19,6 +19,7 @@ from edge_unit.daemon.background_learning import Learning
 from edge_unit.daemon.background_store import BackgroundStore
 from edge_unit.daemon.calibration_task import localise
 from edge_unit.daemon.command_batch import Orders, put_back
+from edge_unit.daemon.frame_limiter import FrameLimiter
 from edge_unit.daemon.frame_processor import FrameWork
 from edge_unit.daemon.image_requests import NO_POSE, Showing
 from edge_unit.daemon.joint_lookup import FrameJoints
@@ -26,16 +27,18 @@ from edge_unit.daemon.pipeline_manager import AssignedPipeline
 from edge_unit.daemon.refinement_task import Refining
 from edge_unit.daemon.report import troubled
 from edge_unit.daemon.task_group import Errands
+from edge_unit.daemon.unit_status import UnitStatus
 from edge_unit.daemon.warm_up import rehearse
 from edge_unit.monitoring import CameraStanding, Progress, Stages, Stance, Trace, boot_id
 from edge_unit.source_factory import is_recording
 from edge_unit.sources.frame import DepthFrame, DepthSource
 from edge_unit.sources.status import ReportsStatus
+from edge_unit.uplink.assignment import Assignment, Delivery, Report, Trouble
 from edge_unit.uplink.cell_cache import CellCache
 from edge_unit.uplink.client import MasterClient
 from edge_unit.uplink.master_discovery import MasterSearch
-from edge_unit.uplink.uplink import Assignment, Delivery, Report, Trouble, Uplink
-from shared.clock import NS_PER_S, monotonic_ns
+from edge_unit.uplink.uplink import Uplink
+from shared.clock import monotonic_ns
 from shared.errors import InputError, SourceError
 from shared.messages import Command, Outcome
 from shared.transforms import Transform
@@ -86,22 +89,21 @@ class Unit:
         self._camera = CameraStanding(config, self.uplink)
         self._trace = None if config.trace_path is None else Trace(config.trace_path)
         self._search = BoardSearch(source, config.board_stream)
-        self._joints = FrameJoints(self.uplink)
-        self._stance = Stance(config.state_dir)
-        self._learning = Learning(BackgroundStore(config.state_dir), config.learn_background_frames, self.uplink.finish)
-        self._assigned = AssignedPipeline(self._learning, self._stance)
-        self._refining = Refining(self.uplink, self._assigned, self._stance)
-        self._work = FrameWork(
-            self.uplink.finish, self._assigned, self._learning, self._refining, self._stance, self._joints
-        )
+        self._work = self._frame_work()
         self._errands = Errands()
-        self._showing = Showing(self.uplink, self._assigned, self._errands)
+        self._showing = Showing(self.uplink, self._work.assigned, self._errands)
         self._progress = Progress()
         self._rehearsal: asyncio.Task[None] | None = None
-        self._next_at_ns = 0
-        self._trouble: str | None = "no frame yet"
-        self._taken = 0
-        self._told = 0, monotonic_ns()
+        self._limiter = FrameLimiter(config.fps_max)
+        self._status = UnitStatus(monotonic_ns())
+
+    def _frame_work(self) -> FrameWork:
+        config, finish = self._config, self.uplink.finish
+        stance = Stance(config.state_dir)
+        learning = Learning(BackgroundStore(config.state_dir), config.learn_background_frames, finish)
+        assigned = AssignedPipeline(learning, stance)
+        refining = Refining(self.uplink, assigned, stance)
+        return FrameWork(finish, assigned, learning, refining, stance, FrameJoints(self.uplink))
 
     async def run(self) -> None:
         """Watch and report.
@@ -133,12 +135,9 @@ class Unit:
 
     def status(self) -> str:
         """One line for a person: camera, frames a second since it was asked last, master."""
-        taken, now_ns = self._taken, monotonic_ns()
-        (before, since_ns), self._told = self._told, (taken, now_ns)
-        trouble = self.uplink.trouble.sentence if self.uplink.trouble else self._trouble
-        if trouble is None:
-            trouble = f"live, {(taken - before) * NS_PER_S / max(now_ns - since_ns, 1):.1f} fps"
-        return f"{trouble}; {self.uplink.standing}"
+        trouble = self.uplink.camera_state.trouble
+        line = self._status.line(None if trouble is None else trouble.sentence, monotonic_ns())
+        return f"{line}; {self.uplink.standing}"
 
     def stuck(self) -> str | None:
         """What hangs and will not come to its end by itself; waiting for a camera or a master is not of that kind."""
@@ -177,7 +176,7 @@ class Unit:
         camera = await self._source.open()
         # Who registers is live with the next frame; but a unit that has to compile first tells that it is there.
         await asyncio.wait((self._rehearsal,), timeout=REHEARSAL_S)
-        self._assigned.open(camera)
+        self._work.assigned.open(camera)
         await self._camera.opened(camera)
         await asyncio.gather(self.uplink.assigned.wait(), self._rehearsal)
         assignment = self.uplink.assignment
@@ -185,7 +184,7 @@ class Unit:
             # Before the camera delivers, so that no frame has to wait for what is compiled and drawn only once.
             # What cannot be prepared is told with each frame, for the master may change it.
             with suppress(InputError), self._progress.working("preparing for frames", PREPARE_S_MAX):
-                await asyncio.to_thread(self._assigned.prepare, assignment, assignment.T_world_camera)
+                await asyncio.to_thread(self._work.assigned.prepare, assignment, assignment.T_world_camera)
 
     def _rehearse(self) -> None:
         with self._progress.working("compiling the kernels", PREPARE_S_MAX):
@@ -194,18 +193,18 @@ class Unit:
     async def _end(self) -> None:
         """A recording has no more frames."""
         await self.uplink.drained(DRAIN_S)
-        if self._learning.progress is None:
+        if self._work.learning.progress is None:
             logger.info("the recording has come to its end")
         else:
-            logger.warning("the recording ended after %d of the %d frames to be learned", *self._learning.progress)
+            logger.warning("the recording ended after %d of the %d frames to be learned", *self._work.learning.progress)
 
     # ------------------------------------------------------------------ a frame
 
     async def _take(self, frame: DepthFrame) -> None:
         """Do with one frame what its time, the master's assignment and its orders ask for."""
-        if not self._is_due(frame):
+        if not self._limiter.due(frame.captured_at_ns):
             return
-        assignment = self.uplink.assignment or self._assigned.assignment
+        assignment = self.uplink.assignment or self._work.assigned.assignment
         if assignment is None:
             return
         orders = Orders.take(self.uplink.commands)
@@ -219,23 +218,14 @@ class Unit:
         else:
             await self._filter(assignment, assignment.T_world_camera, frame, orders)
 
-    def _is_due(self, frame: DepthFrame) -> bool:
-        """Whether `fps_max` leaves time for it."""
-        if self._config.fps_max is None:
-            return True
-        if frame.captured_at_ns < self._next_at_ns:
-            return False
-        self._next_at_ns = frame.captured_at_ns + round(0.9 * NS_PER_S / self._config.fps_max)
-        return True
-
     async def _look_for_pose(self, assignment: Assignment, frame: DepthFrame, orders: Orders) -> None:
         """Say that nobody knows where the camera stands, and look for the board now and then."""
-        self._assigned.pipeline = None
+        self._work.assigned.pipeline = None
         self._finish(orders.changes, Outcome("refused", NO_POSE))
         seen = self._search.outcome
         searching = Trouble("board", f"looking for the board: {seen}") if seen else None
         report = troubled(assignment, frame, searching)
-        self._trouble = report.health.trouble or NO_POSE
+        self._status.note_trouble(report.health.trouble or NO_POSE)
         self.uplink.offer(report)
         await self._showing.show(orders.pictures, frame, None)
         wanted = self._config.localise and assignment.cell.board is not None
@@ -248,35 +238,20 @@ class Unit:
         """Process the frame and offer the result; nothing that follows delays it."""
         stages = Stages(frame.captured_at_ns)
         stages.end("source")
-        joints = await self._joints.at(assignment, frame)
+        joints = await self._work.joints.at(assignment, frame)
         stages.end("joints")
-        prepared = assignment is self._assigned.assignment and not orders.changes and not orders.pictures
+        prepared = assignment is self._work.assigned.assignment and not orders.changes and not orders.pictures
         with self._progress.working(f"frame {frame.frame_number}", FRAME_S_MAX if prepared else PREPARE_S_MAX):
             if self._trace is not None:
                 await asyncio.to_thread(self._trace.flush)
             report = await asyncio.to_thread(
                 self._work.process, assignment, T_world_camera, frame, joints, orders.changes, stages
             )
-        self._taken += 1
-        self._tell_change(report.health.trouble)
+        self._status.note_frame(report.health.trouble)
         self.uplink.offer(report)
         await self._showing.show(orders.pictures, frame, joints)
-        pipeline = self._assigned.pipeline
-        if pipeline is not None and joints is not None and report.health.trouble is None:
-            look = self._joints.watch_delay(pipeline, frame)
-            if look is not None:
-                self._errands.start(asyncio.to_thread(look))
-        if self._stance.unsaved:
-            self._errands.start(asyncio.to_thread(self._stance.save))
-        gathered = self._refining.take()
-        if gathered is not None:
-            self._errands.start(self._refining.refine(gathered))
-
-    def _tell_change(self, trouble: str | None) -> None:
-        """Have the log say when trouble begins or ends."""
-        if (trouble is None) != (self._trouble is None):
-            logger.info("%s", trouble or "frames are filtered and reported")
-        self._trouble = trouble
+        for task in self._work.afterwards(frame, joints, report):
+            self._errands.start(task)
 
     def _finish(self, commands: list[Command], outcome: Outcome) -> None:
         for command in commands:

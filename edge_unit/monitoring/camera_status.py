@@ -10,7 +10,8 @@ from edge_unit.config import UnitConfig
 from edge_unit.monitoring.last_camera import CameraMemory
 from edge_unit.sources.frame import CameraInfo
 from edge_unit.sources.status import ReportsStatus
-from edge_unit.uplink.uplink import Trouble, Uplink
+from edge_unit.uplink.assignment import Trouble
+from edge_unit.uplink.uplink import Uplink
 from shared.errors import SourceError
 from shared.messages import MAX_TEXT, ToldOrigin
 from shared.transforms import Transform
@@ -39,13 +40,13 @@ class CameraStanding:
         self._camera = camera
         pose = camera.T_world_camera
         self._uplink.set_camera(camera, self.known_pose or (None if pose is None else (pose, "source")))
-        self._uplink.trouble = None
+        self._uplink.camera_state.trouble = None
         await asyncio.to_thread(self._memory.save, camera)
 
     async def failed(self, error: SourceError) -> None:
         """It does not deliver."""
         logger.warning("%s", error)
-        self._uplink.trouble = Trouble("camera", f"camera: {error}")
+        self._uplink.camera_state.trouble = Trouble("camera", f"camera: {error}")
         await self._register_the_missing()
 
     async def follow(self, source: ReportsStatus) -> None:
@@ -54,8 +55,8 @@ class CameraStanding:
         while True:
             if status.state != "closed":
                 trouble = status.trouble
-                self._uplink.trouble = None if trouble is None else Trouble("camera", trouble)
-                self._uplink.warning = status.warning[:MAX_TEXT] or None
+                self._uplink.camera_state.trouble = None if trouble is None else Trouble("camera", trouble)
+                self._uplink.camera_state.warning = status.warning[:MAX_TEXT] or None
                 if status.state == "absent":
                     await self._register_the_missing()
             status = await source.next_status(status)

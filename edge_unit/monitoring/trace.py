@@ -18,7 +18,7 @@ from typing import Any
 
 import msgpack
 
-from edge_unit.uplink.uplink import Delivery, Report
+from edge_unit.uplink.assignment import Delivery, Report
 from shared.errors import ConfigError
 
 logger = logging.getLogger(__name__)

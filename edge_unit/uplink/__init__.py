@@ -7,5 +7,9 @@ What only asks a master needs no pipeline, so this page re-exports nothing. In t
     master_discovery  looks for the master while it does not answer
     client            what a unit can ask the master
     cell_cache        the master's cell, kept on disk
+    assignment        what the master wants of a unit, and what the unit reports, as values
+    outbox            the report that is sent next: latest-only
+    command_ledger    the master's commands, and what became of them
+    session           what holds from one registration to the next
     uplink            the exchange with the master, latest-only
 """

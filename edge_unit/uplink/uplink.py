@@ -21,16 +21,19 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from edge_unit.joints import JointHistory
-from edge_unit.pipeline import SeenBlocks
 from edge_unit.sources.frame import CameraInfo
+from edge_unit.uplink.assignment import Assignment, Delivery, LatestAssignment, Report, Trouble, seen_report
 from edge_unit.uplink.cell_cache import CellCache
 from edge_unit.uplink.client import MasterClient
+from edge_unit.uplink.command_ledger import CommandLedger
 from edge_unit.uplink.master_discovery import MasterSearch
+from edge_unit.uplink.outbox import Outbox
+from edge_unit.uplink.session import Session
 from shared.cell import Cell
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import (
@@ -42,42 +45,30 @@ from shared.errors import (
     NewerContract,
     WireError,
 )
-from shared.lattice import Lattice
 from shared.messages import (
     CONTRACT_MINOR,
     CONTRACT_VERSION,
     DONE,
-    MAX_COMMANDS,
-    MAX_TEXT,
     CellReference,
     Command,
-    Ended,
     Health,
     InitializeAnswer,
     InitializeRequest,
     Outcome,
     Phase,
     PoseQuality,
-    Progress,
-    SeenReport,
     SlotAnswer,
     ToldOrigin,
-    TroubleCode,
     UpdateAnswer,
     UpdateRequest,
     Versions,
     matrix_of,
 )
-from shared.settings import Settings
-from shared.timebase import ClockOffset, Exchange
+from shared.timebase import ClockOffset
 from shared.transforms import Transform, validated
-from shared.waiting import within
-from shared.wire import decode, pack_seen
+from shared.wire import decode
 
 logger = logging.getLogger(__name__)
-
-HEARTBEAT_S = 0.2
-"""Without a new frame the last report is sent again, often enough for the shortest sensible staleness."""
 
 RETRY_MIN_S = 0.05
 RETRY_MAX_S = 0.25
@@ -96,45 +87,6 @@ START_OVER = frozenset({401, 403, 404, 409})
 """The master does not know this token, unit, session or address any more: register again."""
 
 
-@dataclass(frozen=True, eq=False)
-class Assignment:
-    """What the master wants of this unit: all that a frame is processed with."""
-
-    session: int
-    versions: Versions
-    settings: Settings
-    lattice: Lattice
-    cell: Cell
-    T_world_camera: Transform | None
-
-
-@dataclass(frozen=True, eq=False)
-class Report:
-    """One frame's result, and the assignment that it was made with. `seen` is None when nothing is known to be seen.
-
-    `stages_ns` is how long the frame spent in each stage, of one that went through all of them.
-    """
-
-    assignment: Assignment
-    captured_at_ns: int | None = None
-    keys: bytes = b""
-    seen: SeenBlocks | None = None
-    health: Health = field(default_factory=Health)
-    stages_ns: dict[str, int] = field(default_factory=dict)
-
-
-class Trouble(NamedTuple):
-    """Why a unit reports no voxels: a code, a sentence, and how far it is with what is to be waited for."""
-
-    code: TroubleCode
-    sentence: str
-    progress: Progress | None = None
-
-    def facts(self) -> dict[str, Any]:
-        """The fields of `Health` that tell it; a sentence that is too long is cut."""
-        return {"trouble": self.sentence[:MAX_TEXT], "trouble_code": self.code, "progress": self.progress}
-
-
 @dataclass(frozen=True)
 class _Unclear:
     """A session of which this unit does not understand all that it would have to obey."""
@@ -145,12 +97,33 @@ class _Unclear:
     since_ns: int
 
 
-class Delivery(NamedTuple):
-    """When a report was sent, when the master had all of it, and when it had merged it: by the unit's clock, in ns."""
+@dataclass
+class _Told:
+    """What the journal was told last, so that it is not told again with each attempt."""
 
-    sent_at_ns: int
-    received_at_ns: int
-    merged_at_ns: int
+    complaint: str = ""
+    refused: str = ""
+    found_by: str = ""
+
+
+@dataclass
+class CameraState:
+    """The camera's trouble and warning, which go along with each update whatever the report's frame told."""
+
+    trouble: Trouble | None = None
+    warning: str | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """Return the fields of `Health` that tell it; empty where all is well."""
+        facts = {} if self.trouble is None else self.trouble.facts()
+        return facts if self.warning is None else facts | {"warning": self.warning}
+
+
+class _Presented(NamedTuple):
+    """The camera to register with, and the pose that the master is told: `T_world_camera` and where it is from."""
+
+    camera: CameraInfo
+    known_pose: tuple[Transform, ToldOrigin] | None
 
 
 class Uplink:
@@ -172,35 +145,38 @@ class Uplink:
         self._client = client
         self._search = search
         self._cells = cells
-        self._software = software
-        self._boot_id = boot_id
-        self._on_sent = on_sent
-        self._camera: CameraInfo | None = None
-        self._known_pose: tuple[Transform, ToldOrigin] | None = None
-        self._fresh: Report | None = None
+        self._program = software, boot_id
+        self._presented: _Presented | None = None
+        self._outbox = Outbox(on_sent)
         self._last: Report | None = None
-        self._wake = asyncio.Event()
-        self._idle = asyncio.Event()
-        self._idle.set()
-        self._exchange: Exchange | None = None
-        self._acknowledged: tuple[Versions, bytes] | None = None
-        self._complaint = ""
-        self._found_by = ""
-        self._id = 0
-        self._sequence = 0
-        self._done: list[Ended] = []
-        self._open_commands: dict[int, Command] = {}
-        self._master_minor = 0
+        self._ledger = CommandLedger()
+        self._session = Session()
+        self._latest = LatestAssignment()
         self._unclear: _Unclear | None = None
-        self._refused = ""
-        self.assignment: Assignment | None = None
-        self.assigned = asyncio.Event()
+        self._told = _Told()
         self.phase: Phase | None = None
-        self.commands: asyncio.Queue[Command] = asyncio.Queue(MAX_COMMANDS)
         self.joints = JointHistory()
-        self.clock = ClockOffset()
-        self.trouble: Trouble | None = None
-        self.warning: str | None = None
+        self.camera_state = CameraState()
+
+    @property
+    def assignment(self) -> Assignment | None:
+        """What the master wants of this unit; None while it is not registered."""
+        return self._latest.value
+
+    @property
+    def assigned(self) -> asyncio.Event:
+        """Set while there is an assignment."""
+        return self._latest.there
+
+    @property
+    def commands(self) -> asyncio.Queue[Command]:
+        """The master's commands that nobody has taken yet."""
+        return self._ledger.waiting
+
+    @property
+    def clock(self) -> ClockOffset:
+        """How far the master's clock is from this unit's, in this session."""
+        return self._session.clock
 
     # ------------------------------------------------------------------ what the unit calls
 
@@ -209,32 +185,24 @@ class Uplink:
 
         `known_pose` (`T_world_camera` and where it is from) is told to the master, which may know better.
         """
-        if self._camera is not None and (self._camera.serial, self._camera.intrinsics) != (
-            camera.serial,
-            camera.intrinsics,
-        ):
+        before = None if self._presented is None else self._presented.camera
+        if before is not None and (before.serial, before.intrinsics) != (camera.serial, camera.intrinsics):
             self._start_over()
-        self._camera = camera
-        self._known_pose = known_pose
-        self._wake.set()
+        self._presented = _Presented(camera, known_pose)
+        self._outbox.wake()
 
     def offer(self, report: Report) -> None:
         """Report this next; what was offered before and not sent yet is dropped."""
-        if self._fresh is not None:
-            self._on_sent(self._fresh, None)
-        self._fresh = report
-        self._idle.clear()
-        self._wake.set()
+        self._outbox.offer(report)
 
     def finish(self, command: Command, outcome: Outcome = DONE) -> None:
-        """A command came to an end: carried out, or why not; the master is told with the next update."""
-        if command.id in self._open_commands:
-            self._done.append(Ended.of(command.id, outcome))
+        """Tell the master with the next update what became of a command; from any thread."""
+        self._ledger.finish(command, outcome)
 
     async def send_picture(self, command: Command, png: bytes) -> None:
         """Send the picture that a command asks for. Raises as `MasterClient.update`."""
         assert command.image is not None
-        await self._client.put_image(self._id, command.image, command.id, png)
+        await self._client.put_image(self._session.id, command.image, command.id, png)
 
     async def tell_pose(self, T_world_camera: Transform, origin: str, quality: PoseQuality) -> None:
         """This unit's camera was found to be there; the next frame is processed with it.
@@ -244,7 +212,7 @@ class Uplink:
             WireError: its answer is none of ours.
         """
         assignment = self.assignment
-        version = await self._client.put_pose(self._id, T_world_camera, origin, quality)
+        version = await self._client.put_pose(self._session.id, T_world_camera, origin, quality)
         if assignment is not None and self.assignment is not None and self.assignment.session == assignment.session:
             versions = self.assignment.versions.model_copy(update={"pose": version})
             self._assign(replace(self.assignment, versions=versions, T_world_camera=T_world_camera))
@@ -254,18 +222,17 @@ class Uplink:
         """How it stands with the master, in words for a person."""
         if self._search is not None and not self._client.url:
             return f"no master: {self._search.outcome}"
-        if self._complaint:
-            return f"no master: {self._complaint}"
+        if self._told.complaint:
+            return f"no master: {self._told.complaint}"
         if self._unclear is not None:
             return self._unclear.trouble.sentence
         if self.assignment is None:
             return f"not registered yet at {self._client.url}"
-        return f"unit {self._id} at {self._client.url}"
+        return f"unit {self._session.id} at {self._client.url}"
 
     async def drained(self, timeout_s: float) -> None:
         """Wait until nothing is left to be sent, but no longer than `timeout_s`."""
-        if not await within(timeout_s, self._idle.wait()):
-            logger.warning("the last frame did not reach the master")
+        await self._outbox.drained(timeout_s)
 
     async def refresh_joints(self, at_master_ns: int) -> None:
         """Ask for joints up to `at_master_ns` if none so new are known; what cannot be had in time is done without."""
@@ -293,11 +260,11 @@ class Uplink:
                     await self._register()
                 else:
                     await self._report(assignment)
-                retry_s, self._complaint = RETRY_MIN_S, ""
+                retry_s, self._told.complaint = RETRY_MIN_S, ""
                 if self._search is not None:
                     self._search.answered(self._client.url)
                 if self.phase == "searching" and self.assignment is not None:
-                    self._enter(_phase_of(self.assignment), f"{self._client.url} answers again")
+                    self._enter(self.assignment.phase, f"{self._client.url} answers again")
             except MasterRefused as error:
                 registered = self.assignment is not None or self._unclear is not None
                 if error.status in START_OVER and registered:
@@ -306,7 +273,7 @@ class Uplink:
                 retry_s = await self._wait(retry_s, error)
             except CellwatchError as error:
                 foreign = isinstance(error, WireError) and self.assignment is None and self._unclear is None
-                if isinstance(error, (WireError, CellError)) and self._master_minor > CONTRACT_MINOR:
+                if isinstance(error, (WireError, CellError)) and self._session.master_minor > CONTRACT_MINOR:
                     # What registering anew cannot clear up is told as trouble then.
                     self._start_over()
                 self._miss(error, foreign or isinstance(error, MasterUnreachable))
@@ -321,7 +288,7 @@ class Uplink:
         place = await self._search.place()
         if place.url != self._client.url:
             self._client.aim(place.url)
-            self._found_by = place.found_by
+            self._told.found_by = place.found_by
             self._start_over()
 
     def _miss(self, error: CellwatchError, lost: bool) -> None:
@@ -340,13 +307,15 @@ class Uplink:
 
     async def _register(self) -> None:
         if self._search is None or not self._search.lost:
-            self._enter("registering", f"at {self._client.url}{f', {self._found_by}' if self._found_by else ''}")
-        while self._camera is None:
-            self._wake.clear()
-            await self._wake.wait()
-        camera = self._camera
+            self._enter(
+                "registering", f"at {self._client.url}{f', {self._told.found_by}' if self._told.found_by else ''}"
+            )
+        while self._presented is None:
+            await self._outbox.woken(heartbeat=False)
+        camera, known_pose = self._presented
         await self._client.authorize()
-        told, origin = self._known_pose or (None, "configured")
+        told, origin = known_pose or (None, "configured")
+        software, boot_id = self._program
         sent_at_ns = monotonic_ns()
         request = InitializeRequest(
             contract=CONTRACT_VERSION,
@@ -354,8 +323,8 @@ class Uplink:
             serial=camera.serial,
             model=camera.model,
             intrinsics=camera.intrinsics,
-            software=self._software,
-            boot_id=self._boot_id,
+            software=software,
+            boot_id=boot_id,
             T_world_camera=None if told is None else matrix_of(told),
             pose_origin=origin,
             sent_at_ns=sent_at_ns,
@@ -383,73 +352,44 @@ class Uplink:
 
     def _begin_session(self, slot: InitializeAnswer | SlotAnswer, sent_at_ns: int) -> None:
         """Registered at `sent_at_ns`: what was before is void."""
-        self.clock = ClockOffset()
+        self._session = Session.begun(slot, sent_at_ns)
         self.joints.clear()
-        self._exchange = Exchange(sent_at_ns, slot.received_at_ns, slot.answered_at_ns, monotonic_ns())
-        self.clock.add(self._exchange)
-        self._master_minor = slot.contract_minor
-        self._id = slot.id
-        self._sequence = 0
-        self._acknowledged = None
-        self._done.clear()
-        self._open_commands.clear()
-        # Those of the session before; the master sends again what it still wants.
-        while not self.commands.empty():
-            self.commands.get_nowait()
+        self._ledger.clear()
 
     def _refuse(self, slot: InitializeAnswer | SlotAnswer, error: CellwatchError) -> None:
         """Do not follow a newer master that is not understood: what is unknown may have to be left unfiltered."""
         theirs, ours = f"{CONTRACT_VERSION}.{slot.contract_minor}", f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
         trouble = Trouble("contract", f"update this unit: it speaks contract {ours}, its master {theirs}: {error}")
         self._unclear = _Unclear(slot.session, slot.versions, trouble, monotonic_ns())
-        level = logging.DEBUG if trouble.sentence == self._refused else logging.WARNING
+        level = logging.DEBUG if trouble.sentence == self._told.refused else logging.WARNING
         logger.log(level, "%s", trouble.sentence)
-        self._refused = trouble.sentence
+        self._told.refused = trouble.sentence
 
     async def _tell_unclear(self, unclear: _Unclear) -> None:
         """Tell why nothing is reported; register again when the master says something else, or now and then."""
-        self._drop_fresh()
-        await self._woken()
-        self._drop_fresh()
+        self._outbox.drop()
+        await self._outbox.woken()
+        self._outbox.drop()
         sent_at_ns = monotonic_ns()
         if sent_at_ns - unclear.since_ns > CONTRACT_RETRY_S * NS_PER_S:
             self._start_over()
             return
-        self._sequence += 1
         answer = await self._client.update(
             UpdateRequest(
-                id=self._id,
+                id=self._session.id,
                 session=unclear.session,
-                sequence=self._sequence,
+                sequence=self._session.next_sequence(),
                 sent_at_ns=sent_at_ns,
-                exchange=self._exchange,
+                exchange=self._session.exchange,
                 # Not that it works with these, but that it knows of them: so it is not told of them again.
                 versions=unclear.versions,
                 health=Health().model_copy(update=unclear.trouble.facts()),
                 phase="fetching",
             )
         )
-        self._exchange = Exchange(sent_at_ns, answer.received_at_ns, answer.answered_at_ns, monotonic_ns())
-        self.clock.add(self._exchange)
+        self._session.note(sent_at_ns, answer)
         if answer.versions != unclear.versions:
             self._start_over()
-
-    def _drop_fresh(self) -> None:
-        """What was offered will not be sent."""
-        if self._fresh is not None:
-            self._on_sent(self._fresh, None)
-            self._fresh = None
-        self._idle.set()
-
-    async def _woken(self) -> None:
-        """Wait until something is to be sent, but no longer than until the next heartbeat."""
-        self._wake.clear()
-        # No wait_for here: until Python 3.12 it swallows a cancellation that comes together with the event.
-        heartbeat = asyncio.get_running_loop().call_later(HEARTBEAT_S, self._wake.set)
-        try:
-            await self._wake.wait()
-        finally:
-            heartbeat.cancel()
 
     async def _get_cell(self, reference: CellReference) -> Cell:
         cell = await self._cells.get(reference, self._client)
@@ -459,80 +399,66 @@ class Uplink:
 
     async def _report(self, assignment: Assignment) -> None:
         """Send the latest report, or, when none comes, the one before again."""
-        if self._fresh is None:
-            await self._woken()
-        fresh, self._fresh = self._fresh, None
+        if self._outbox.empty:
+            await self._outbox.woken()
+        fresh = self._outbox.take()
         report = fresh or self._last or Report(assignment)
         if report.assignment.session != assignment.session:
             # Made for a session that is over, in which the same versions may have meant something else.
             if fresh is not None:
-                self._on_sent(fresh, None)
+                self._outbox.sent(fresh, None)
             report = Report(assignment)
         self._last = report
         try:
             answer, delivery = await self._exchange_update(assignment, report)
         except CellwatchError:
-            self._put_back(fresh)
+            self._outbox.put_back(fresh)
             raise
         finally:
-            if self._fresh is None:
-                self._idle.set()
+            self._outbox.settle()
         if fresh is not None:
-            self._on_sent(fresh, delivery)
+            self._outbox.sent(fresh, delivery)
         await self._follow(assignment, answer)
 
-    def _put_back(self, report: Report | None) -> None:
-        """What could not be sent is tried again, unless a newer one came meanwhile."""
-        if self._fresh is None:
-            self._fresh = report
-        elif report is not None:
-            self._on_sent(report, None)
-
     async def _exchange_update(self, assignment: Assignment, report: Report) -> tuple[UpdateAnswer, Delivery]:
-        self._sequence += 1
-        versions = report.assignment.versions
+        session, versions = self._session, report.assignment.versions
         seen_bits = report.seen.packed() if report.seen is not None else b""
         seen = None
-        if report.seen is not None and self._acknowledged != (versions, seen_bits):
+        if report.seen is not None and session.acknowledged != (versions, seen_bits):
             seen = seen_report(report.seen)
             # Until the master has answered nobody knows which of the two it holds.
-            self._acknowledged = None
-        done = tuple(self._done[:MAX_COMMANDS])
-        health = report.health
-        if self.trouble is not None:
-            health = health.model_copy(update=self.trouble.facts())
-        if self.warning is not None:
-            health = health.model_copy(update={"warning": self.warning})
+            session.acknowledged = None
+        done = self._ledger.ended()
+        health = report.health.model_copy(update=self.camera_state.facts())
         sent_at_ns = monotonic_ns()
         answer = await self._client.update(
             UpdateRequest(
-                id=self._id,
+                id=session.id,
                 session=assignment.session,
-                sequence=self._sequence,
+                sequence=session.next_sequence(),
                 captured_at_ns=report.captured_at_ns,
                 sent_at_ns=sent_at_ns,
-                exchange=self._exchange,
+                exchange=session.exchange,
                 versions=versions,
                 keys=report.keys,
                 seen=seen,
                 health=health,
                 joints_until_ns=self.joints.newest_ns,
                 done=done,
-                phase=_phase_of(assignment),
+                phase=assignment.phase,
             )
         )
-        self._exchange = Exchange(sent_at_ns, answer.received_at_ns, answer.answered_at_ns, monotonic_ns())
-        self.clock.add(self._exchange)
+        session.note(sent_at_ns, answer)
         self.joints.add(answer.joints)
         if report.seen is not None:
-            self._acknowledged = versions, seen_bits
-        self._forget_commands(done)
-        offset_ns = self.clock.offset_ns
+            session.acknowledged = versions, seen_bits
+        self._ledger.forget(done)
+        offset_ns = session.clock.offset_ns
         return answer, Delivery(sent_at_ns, answer.received_at_ns - offset_ns, answer.answered_at_ns - offset_ns)
 
     async def _follow(self, assignment: Assignment, answer: UpdateAnswer) -> None:
         """Do what the master's answer asks for."""
-        self._accept_commands(answer.commands)
+        self._ledger.accept(answer.commands)
         if answer.versions == assignment.versions:
             return
         changed = replace(assignment, versions=answer.versions)
@@ -549,48 +475,21 @@ class Uplink:
             # Otherwise the camera was changed meanwhile, and this session is over.
             self._assign(changed)
 
-    def _accept_commands(self, commands: Iterable[Command]) -> None:
-        for command in commands:
-            if command.id not in self._open_commands and not self.commands.full():
-                self._open_commands[command.id] = command
-                self.commands.put_nowait(command)
-
-    def _forget_commands(self, done: Iterable[Ended]) -> None:
-        for ended in done:
-            self._done.remove(ended)
-            self._open_commands.pop(ended.id, None)
-
     def _assign(self, assignment: Assignment, how: str = "") -> None:
-        self.assignment = assignment
-        self.assigned.set()
+        self._latest.set(assignment)
         pose = "nobody knows its camera's pose" if assignment.T_world_camera is None else "its camera's pose is known"
-        self._enter(_phase_of(assignment), f"{how}{pose}")
+        self._enter(assignment.phase, f"{how}{pose}")
 
     def _start_over(self) -> None:
-        self.assignment = None
+        self._latest.clear()
         self._unclear = None
-        self.assigned.clear()
 
     async def _wait(self, retry_s: float, error: CellwatchError) -> float:
         """Wait before the next attempt; returns how long to wait after that."""
         # Once each: a master that is gone, and then one with another certificate.
-        new = retry_s == RETRY_MIN_S or str(error) != self._complaint
-        self._complaint = str(error)
+        new = retry_s == RETRY_MIN_S or str(error) != self._told.complaint
+        self._told.complaint = str(error)
         level = logging.WARNING if new or isinstance(error, ConfigError) else logging.DEBUG
         logger.log(level, "%s", error)
         await asyncio.sleep(retry_s * random.uniform(0.8, 1.2))
         return min(2.0 * retry_s, RETRY_MAX_S)
-
-
-def _phase_of(assignment: Assignment) -> Phase:
-    return "localising" if assignment.T_world_camera is None else "live"
-
-
-def seen_report(seen: SeenBlocks) -> SeenReport:
-    """The blocks as a report, in larger ones where it would be too long."""
-    while True:
-        nx, ny, nz = seen.lattice.shape
-        report = pack_seen(seen.seen.reshape(nx, ny, nz), seen.lattice.voxel_size_m)
-        if report is not None:
-            return report
-        seen = seen.coarser()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from edge_unit import __main__
 from edge_unit.daemon.frame_processor import FrameWork
-from edge_unit.uplink.uplink import Report
+from edge_unit.uplink.assignment import Report
 
 HANG = Path("/run/hang")
 

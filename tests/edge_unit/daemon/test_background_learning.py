@@ -12,7 +12,7 @@ from edge_unit.daemon.background_learning import Learning
 from edge_unit.daemon.background_store import BackgroundStore, Place
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.sources.frame import CameraInfo
-from edge_unit.uplink.uplink import Trouble
+from edge_unit.uplink.assignment import Trouble
 from shared.camera import Intrinsics
 from shared.cell import Cell
 from shared.messages import Command, Outcome, OutcomeCode, Progress

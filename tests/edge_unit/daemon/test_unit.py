@@ -32,8 +32,8 @@ from edge_unit.monitoring import read_trace
 from edge_unit.sources.frame import CameraInfo, DepthFrame
 from edge_unit.sources.image import ImageFrame, ImageInfo, ImageStream
 from edge_unit.sources.simulated import SimulatedSourceConfig
-from edge_unit.uplink import uplink as uplink_module
 from edge_unit.uplink.client import MasterClient
+from edge_unit.uplink.outbox import HEARTBEAT_S
 from master_server.app import make_app
 from master_server.core import Master
 from master_server.core.units import Slot
@@ -265,7 +265,7 @@ async def test_settings_cell_and_pose_change_while_it_runs(tmp_path: Path) -> No
         before = bench.voxels()
         bench.master.change_settings({"voxel_size_m": 0.1})
         assert bench.voxels() == set()
-        await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
+        await asyncio.sleep(2.0 * HEARTBEAT_S)
         bench.show(patch(1225))
         await bench.until_state("live")
         coarse = bench.voxels()
@@ -273,7 +273,7 @@ async def test_settings_cell_and_pose_change_while_it_runs(tmp_path: Path) -> No
         assert {index[2] for index in coarse} == {2}
 
         bench.master.set_pose(1, _matrix(BESIDE), "operator", None)
-        await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
+        await asyncio.sleep(2.0 * HEARTBEAT_S)
         bench.show(patch(1225))
         await bench.until_state("live")
         assert {(x, y + 5, z) for x, y, z in coarse} == bench.voxels()
@@ -292,7 +292,7 @@ async def test_without_a_pose_it_waits_for_one(tmp_path: Path) -> None:
         await bench.until_state("uncalibrated")
         assert bench.voxels() == set()
         bench.master.set_pose(1, _matrix(ABOVE), "operator", None)
-        await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
+        await asyncio.sleep(2.0 * HEARTBEAT_S)
         bench.show(patch(1225))
         await bench.until_state("live")
         assert bench.voxels()
@@ -353,7 +353,7 @@ async def test_another_master_never_gets_voxels_of_the_first_ones_lattice(tmp_pa
         # All version numbers begin at 1 again, and mean another lattice.
         bench.serve(make_master(voxel_size_m=0.1, stale_after_s=60.0))
         await bench.until(bench.row, "registered")
-        await asyncio.sleep(3.0 * uplink_module.HEARTBEAT_S)
+        await asyncio.sleep(3.0 * HEARTBEAT_S)
         assert bench.voxels() == set()
         bench.show(patch(1225))
         await bench.until_state("live")
@@ -495,7 +495,7 @@ async def test_the_background_is_learned_kept_and_used_again(tmp_path: Path) -> 
         await bench.until(lambda: (row := bench.row()) and row.frame_number == 5, "the next frame")
         assert bench.voxels() == set()
         command = bench.master.ask(1, "drop_background", monotonic_ns())
-        await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
+        await asyncio.sleep(2.0 * HEARTBEAT_S)
         bench.show(patch(1225))
         await bench.until(bench.voxels, "no background")
         done = CommandRow(id=command.id, verb="drop_background", outcome="done", code="done")
@@ -590,7 +590,7 @@ async def test_a_refined_pose_keeps_what_was_learned(tmp_path: Path) -> None:
         assert (await bench.refine()).code == "done"
         bench.show(bench.frame)
         row = await bench.until_state("live")
-        pipeline = bench.unit._assigned.pipeline
+        pipeline = bench.unit._work.assigned.pipeline
         assert pipeline is not None
         assert pipeline.reference is not None
         assert np.array_equal(pipeline.T_world_camera, np.array(row.T_world_camera))
@@ -746,14 +746,14 @@ async def test_it_looks_for_the_board_when_asked_even_if_it_has_a_pose(tmp_path:
         await bench.until_state("live")
         assert source.looks == 0
         bench.master.ask(1, "calibrate", monotonic_ns())
-        await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
+        await asyncio.sleep(2.0 * HEARTBEAT_S)
         bench.show(patch(1225))
         row = await bench.until(lambda: (row := bench.row()) and row.last_command.outcome and row, "its outcome")
         assert row.last_command.code == "done"
         assert np.abs(np.array(row.T_world_camera) - ABOVE.transform()).max() < 5e-3
         source.mounted = False
         bench.master.ask(1, "calibrate", monotonic_ns())
-        await asyncio.sleep(2.0 * uplink_module.HEARTBEAT_S)
+        await asyncio.sleep(2.0 * HEARTBEAT_S)
         bench.show(patch(1225))
         row = await bench.until(
             lambda: (row := bench.row()) and row.last_command.id == 2 and row.last_command.outcome and row, "2"

@@ -14,6 +14,7 @@ from edge_unit.monitoring import CameraStanding
 from edge_unit.monitoring.last_camera import CameraMemory
 from edge_unit.sources.frame import CameraInfo
 from edge_unit.sources.realsense.source import RealsenseSourceConfig
+from edge_unit.uplink.uplink import CameraState
 from shared.camera import Intrinsics
 from shared.errors import SourceError
 from shared.messages import MAX_TEXT, Health
@@ -26,7 +27,7 @@ class Told:
 
     def __init__(self) -> None:
         self.cameras: list[CameraInfo] = []
-        self.trouble: Any = None
+        self.camera_state = CameraState()
 
     def set_camera(self, camera: CameraInfo, known_pose: object) -> None:
         self.cameras.append(camera)
@@ -45,8 +46,8 @@ async def test_the_one_of_before_is_missed_if_it_is_wanted(
     camera, told = standing(tmp_path, wanted)
     await camera.failed(SourceError("x" * 2 * MAX_TEXT))
     assert told.cameras == expected
-    assert told.trouble.code == "camera"
-    assert len(Health(**told.trouble.facts()).trouble or "") == MAX_TEXT
+    assert told.camera_state.trouble.code == "camera"
+    assert len(Health(**told.camera_state.trouble.facts()).trouble or "") == MAX_TEXT
 
 
 async def test_one_that_is_here_is_remembered_and_no_other_is_missed(tmp_path: Path) -> None:
@@ -54,8 +55,8 @@ async def test_one_that_is_here_is_remembered_and_no_other_is_missed(tmp_path: P
     camera, told = standing(tmp_path)
     await camera.opened(CAMERA)
     assert await asyncio.to_thread(CameraMemory(tmp_path).load) == CAMERA
-    assert not told.trouble
+    assert not told.camera_state.trouble
     await camera.failed(SourceError("unplugged"))
-    assert told.trouble.code == "camera"
-    assert "unplugged" in told.trouble.sentence
+    assert told.camera_state.trouble.code == "camera"
+    assert "unplugged" in told.camera_state.trouble.sentence
     assert told.cameras == [CAMERA]

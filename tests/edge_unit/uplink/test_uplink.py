@@ -15,9 +15,10 @@ import pytest
 from edge_unit.pipeline import SeenBlocks
 from edge_unit.sources.frame import CameraInfo
 from edge_unit.uplink import uplink as module
+from edge_unit.uplink.assignment import Delivery, Report, Trouble, seen_report
 from edge_unit.uplink.cell_cache import CellCache
 from edge_unit.uplink.client import TIMEOUT, MasterClient
-from edge_unit.uplink.uplink import Delivery, Report, Trouble, Uplink, seen_report
+from edge_unit.uplink.uplink import Uplink
 from shared.camera import Intrinsics
 from shared.cell import Cell
 from shared.clock import monotonic_ns
@@ -332,9 +333,9 @@ async def test_what_is_seen_is_told_when_it_changes_and_until_it_is_known() -> N
 
 async def test_trouble_goes_along_with_every_report() -> None:
     async with running() as bench:
-        bench.uplink.trouble = Trouble("camera", "camera: unplugged")
+        bench.uplink.camera_state.trouble = Trouble("camera", "camera: unplugged")
         await until(lambda: bench.master.updates and bench.master.updates[-1].health.trouble == "camera: unplugged")
-        bench.uplink.trouble = None
+        bench.uplink.camera_state.trouble = None
         await until(lambda: bench.master.updates[-1].health.trouble is None)
 
 

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The master's commands: those that wait, those that are being carried out, and what became of the others.
+
+`finish` is the one door by which the thread that works on frames tells the event loop anything; all else here belongs
+to the loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable
+from queue import Empty, SimpleQueue
+
+from shared.messages import DONE, MAX_COMMANDS, Command, Ended, Outcome
+
+
+class CommandLedger:
+    """One session's commands.
+
+    Attributes:
+        waiting: those that nobody has taken yet.
+    """
+
+    def __init__(self) -> None:
+        self.waiting: asyncio.Queue[Command] = asyncio.Queue(MAX_COMMANDS)
+        self._open: dict[int, Command] = {}
+        self._finished: SimpleQueue[Ended] = SimpleQueue()
+        self._ended: list[Ended] = []
+
+    def accept(self, commands: Iterable[Command]) -> None:
+        """Have new commands wait; the master sends again what finds no room."""
+        for command in commands:
+            if command.id not in self._open and not self.waiting.full():
+                self._open[command.id] = command
+                self.waiting.put_nowait(command)
+
+    def finish(self, command: Command, outcome: Outcome = DONE) -> None:
+        """Tell the master with the next update what became of a command; from any thread."""
+        self._finished.put(Ended.of(command.id, outcome))
+
+    def ended(self) -> tuple[Ended, ...]:
+        """Return what the master is to be told now, at most MAX_COMMANDS."""
+        while True:
+            try:
+                ended = self._finished.get_nowait()
+            except Empty:
+                return tuple(self._ended[:MAX_COMMANDS])
+            if ended.id in self._open:
+                self._ended.append(ended)
+
+    def forget(self, told: Iterable[Ended]) -> None:
+        """Forget what the master has heard."""
+        for ended in told:
+            self._ended.remove(ended)
+            self._open.pop(ended.id, None)
+
+    def clear(self) -> None:
+        """Forget the session's commands; the master sends again what it still wants."""
+        self._open.clear()
+        self.ended()
+        self._ended.clear()
+        while not self.waiting.empty():
+            self.waiting.get_nowait()

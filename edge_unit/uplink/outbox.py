@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report that is sent next: a slot of one, so that a slow network costs frames and never delay."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+
+from edge_unit.uplink.assignment import Delivery, Report
+from shared.waiting import within
+
+logger = logging.getLogger(__name__)
+
+HEARTBEAT_S = 0.2
+"""Without a new frame the last report is sent again, often enough for the shortest sensible staleness."""
+
+
+class Outbox:
+    """Latest-only. `on_sent` is told of each report how it reached the master; None: it never did."""
+
+    def __init__(self, on_sent: Callable[[Report, Delivery | None], None]) -> None:
+        self._on_sent = on_sent
+        self._fresh: Report | None = None
+        self._wake = asyncio.Event()
+        self._idle = asyncio.Event()
+        self._idle.set()
+
+    @property
+    def empty(self) -> bool:
+        """True while nothing new is to be sent."""
+        return self._fresh is None
+
+    def offer(self, report: Report) -> None:
+        """Send this next; what was offered before and not sent yet is dropped."""
+        if self._fresh is not None:
+            self._on_sent(self._fresh, None)
+        self._fresh = report
+        self._idle.clear()
+        self._wake.set()
+
+    def take(self) -> Report | None:
+        """Return what was offered, which is out of the slot then."""
+        fresh, self._fresh = self._fresh, None
+        return fresh
+
+    def sent(self, report: Report, delivery: Delivery | None) -> None:
+        """Tell of a report that was taken how it reached the master, or None: it never did."""
+        self._on_sent(report, delivery)
+
+    def put_back(self, report: Report | None) -> None:
+        """Try again what could not be sent, unless a newer one came meanwhile."""
+        if self._fresh is None:
+            self._fresh = report
+        elif report is not None:
+            self._on_sent(report, None)
+
+    def drop(self) -> None:
+        """Send nothing of what was offered."""
+        if self._fresh is not None:
+            self._on_sent(self._fresh, None)
+            self._fresh = None
+        self._idle.set()
+
+    def settle(self) -> None:
+        """Note that an exchange ended: with nothing new, all is sent."""
+        if self._fresh is None:
+            self._idle.set()
+
+    def wake(self) -> None:
+        """End the wait for something to be sent."""
+        self._wake.set()
+
+    async def woken(self, *, heartbeat: bool = True) -> None:
+        """Wait until something is to be sent, with `heartbeat` no longer than until the next one."""
+        self._wake.clear()
+        # No wait_for here: until Python 3.12 it swallows a cancellation that comes together with the event.
+        timer = asyncio.get_running_loop().call_later(HEARTBEAT_S, self._wake.set) if heartbeat else None
+        try:
+            await self._wake.wait()
+        finally:
+            if timer is not None:
+                timer.cancel()
+
+    async def drained(self, timeout_s: float) -> None:
+        """Wait until nothing is left to be sent, but no longer than `timeout_s`."""
+        if not await within(timeout_s, self._idle.wait()):
+            logger.warning("the last frame did not reach the master")

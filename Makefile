@@ -110,8 +110,8 @@ lint: $(READY) ## ruff, and mypy for this Python and for 3.10
 	$(BIN)/mypy --no-error-summary --config-file scripts/mypy-3.10.ini $(TYPED) || failed=1;) \
 	exit $$failed
 
-clean: ## takes out .venv and all caches
-	rm -rf $(VENV) build dist out .mypy_cache .pytest_cache .ruff_cache .hypothesis
+clean: ## takes out .venv and all caches, and leaves the results in out/
+	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(READY): pyproject.toml constraints.txt

@@ -12,6 +12,7 @@ import asyncio
 import logging
 import os
 import platform
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -23,7 +24,7 @@ from edge_unit.config import ENVIRONMENT_PREFIX, UnitConfig
 from edge_unit.sources.frame import DepthSource
 from edge_unit.sources.recorded import RecordedSourceConfig
 from edge_unit.sources.simulated import SimulatedSource, SimulatedSourceConfig
-from geometry.compilation.cache import settle, settle_for
+from geometry.compilation.cache import folder_beside, settle, settle_for
 from geometry.compilation.prebuilt import TARGETS, target_of
 from shared.configuration import assignments, load
 from shared.errors import CellwatchError, ConfigError
@@ -131,12 +132,15 @@ def _compile_kernels(options: argparse.Namespace) -> int:
         raise ConfigError(f"--target: kernels are compiled on {platform.machine()} for {platform.machine()} only")
     folder = settle_for(target, options.folder)
     from edge_unit.daemon.warm_up import rehearse
+    from geometry.rendering.hull_store import FOLDER as HULLS
 
     rehearse()
     if options.config is not None:
         source = load(UnitConfig, options.config, os.environ, ENVIRONMENT_PREFIX, {}).source
         if isinstance(source, SimulatedSourceConfig):
             asyncio.run(_look_once(SimulatedSource(source)))
+    # Hulls belong to a cell and are kept beside a unit's own kernels; a release carries none.
+    shutil.rmtree(folder_beside(HULLS), ignore_errors=True)
     print(f"{folder}: {len(list(folder.rglob('*.nbi')))} kernels for {target.name}")
     return 0
 

@@ -29,8 +29,8 @@ def default_state_dir(program: str) -> Path:
     return Path(home) / "cellwatch" / program
 
 
-def write_whole(path: Path, content: bytes, *, synced: bool = True) -> None:
-    """Write a file whole or not at all.
+def write_whole(path: Path, content: bytes, *, synced: bool = True, contended: bool = False) -> None:
+    """Write a file whole or not at all; where it is `contended`, several processes may do so at a time.
 
     When it is `synced` it is on the disk once this returns. Without, it is only whole for those who read it while the
     power stays on: for what is read by another process, or checked and made anew when it is damaged.
@@ -38,7 +38,8 @@ def write_whole(path: Path, content: bytes, *, synced: bool = True) -> None:
     Raises:
         OSError: it cannot be written; what was there stays.
     """
-    _write(path, content, 0o666, None, synced)
+    partial = path.with_suffix(f".{os.getpid()}.partial") if contended else path.with_suffix(".partial")
+    _write(path, content, 0o666, None, synced, partial)
 
 
 def write_private(path: Path, content: bytes, owner: tuple[int, int] | None = None) -> None:
@@ -49,7 +50,7 @@ def write_private(path: Path, content: bytes, owner: tuple[int, int] | None = No
     Raises:
         OSError: it cannot be written; what was there stays.
     """
-    _write(path, content, 0o600, owner, synced=True)
+    _write(path, content, 0o600, owner, synced=True, partial=path.with_suffix(".partial"))
 
 
 def sync_folder(folder: Path) -> None:
@@ -106,8 +107,7 @@ class StateFile:
         self._path.unlink(missing_ok=True)
 
 
-def _write(path: Path, content: bytes, mode: int, owner: tuple[int, int] | None, synced: bool) -> None:
-    partial = path.with_suffix(".partial")
+def _write(path: Path, content: bytes, mode: int, owner: tuple[int, int] | None, synced: bool, partial: Path) -> None:
     try:
         with os.fdopen(_new(partial, mode), "wb") as file:
             if owner is not None:

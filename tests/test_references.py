@@ -9,13 +9,14 @@ from __future__ import annotations
 import ast
 import builtins
 import re
-import subprocess
 from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
+
+from tests.project_files import project_files
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 PACKAGES = ("shared", "geometry", "edge_unit", "master_server", "simulation", "benchmarks", "qualification", "tests")
@@ -45,17 +46,15 @@ BESIDE = CHECKOUT.parent / "shared" / "data"
 @cache
 def tracked() -> tuple[Path, ...]:
     """Every text file of the project."""
-    git = ("git", "-C", str(CHECKOUT), "ls-files", "-z", "--cached", "--others", "--exclude-standard")
-    names = subprocess.run(git, capture_output=True, check=True, text=True).stdout.split("\0")
     files = []
-    for name in names:
-        if not name or name.startswith(WRITTEN_ELSEWHERE) or not (CHECKOUT / name).is_file():
+    for file in project_files(CHECKOUT):
+        if file.relative_to(CHECKOUT).as_posix().startswith(WRITTEN_ELSEWHERE):
             continue
         try:
-            (CHECKOUT / name).read_text(encoding="utf-8")
+            file.read_text(encoding="utf-8")
         except UnicodeDecodeError:  # a picture
             continue
-        files.append(CHECKOUT / name)
+        files.append(file)
     return tuple(files)
 
 

@@ -17,7 +17,7 @@ ATTRIBUTES_MAX = 15
 """Of a class, its own: fields in its body and what its methods set. With more of them it is several classes."""
 
 PARAMETERS_MAX = 10
-"""Of a function, besides `self` or `cls`; kernels take arrays one by one, and lie in a package of their own."""
+"""Of a function, besides `self` or `cls`; kernels lie in a package of their own."""
 
 ALLOWED = {
     "edge_unit/config.py: UnitConfig": "one attribute for each name that may stand in a unit's configuration",

@@ -6,7 +6,7 @@ without a home of its own would not even start. A folder that was filled before 
 
 It compiles a kernel anew when the kernel's own file has changed, and not when that of a kernel or a constant has which
 it uses. So each state of all the kernels has a folder of its own. Kernels that came with the release are found in it,
-where they fit (`carried_kernels`); otherwise they are compiled for this very processor.
+where they fit (`prebuilt`); otherwise they are compiled for this very processor.
 
 It waits for no disk when it writes, and takes what it finds for whole: after a power cut it would raise at each start.
 So files that are empty or cut short are taken out, and compiled anew.
@@ -26,7 +26,7 @@ from io import BytesIO
 from pathlib import Path
 
 from geometry.compilation.kernel_state import state_of_kernels
-from geometry.compilation.prebuilt import PREFIX, Target, carried, link
+from geometry.compilation.prebuilt import PARTIAL, PREFIX, Target, carried, link
 from shared.errors import JitCacheError
 
 logger = logging.getLogger(__name__)
@@ -106,7 +106,9 @@ def _use(parent: Path) -> Path:
         folder.mkdir(exist_ok=True)
         os.utime(folder)
         states = sorted(parent.glob(f"{PREFIX}*"), key=lambda path: path.stat().st_mtime)
-        for old in states[:-STATES_MAX]:
+        # What a power cut left of a folder of links; one that is being made is younger than any state.
+        left_behind = [path for path in parent.glob(f"{PARTIAL}*") if path.stat().st_mtime < states[0].stat().st_mtime]
+        for old in (*states[:-STATES_MAX], *left_behind):
             shutil.rmtree(old, ignore_errors=True)
     _take_out_damaged(folder)
     _tell_numba(folder)

@@ -22,6 +22,9 @@ VARIABLE = "CELLWATCH_CARRIED_KERNELS"
 PREFIX = "kernels-"
 """Of the folders' names; the rest is a digest of the source, and where they were carried from if they were."""
 
+PARTIAL = f"partial-{PREFIX}"
+"""Of a folder of links that is being made; by its name it is none of the states that are kept."""
+
 CPUINFO = Path("/proc/cpuinfo")
 
 FLAGS_LINES = {"aarch64": "Features", "x86_64": "flags"}
@@ -86,7 +89,7 @@ def link(kernels: Path, parent: Path) -> Path:
     place = hashlib.sha256(bytes(kernels)).hexdigest()[:8]
     folder = parent / f"{kernels.name}-{place}"
     if not folder.is_dir():
-        with tempfile.TemporaryDirectory(prefix=f"{PREFIX}partial-", dir=parent) as partial:
+        with tempfile.TemporaryDirectory(prefix=PARTIAL, dir=parent) as partial:
             whole = Path(partial) / "whole"
             whole.mkdir()
             for file in kernels.glob("*/*"):

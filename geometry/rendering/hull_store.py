@@ -88,7 +88,7 @@ class HullStore:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._make_room(size)
             # One that a power cut leaves damaged is found out by its checksum.
-            write_whole(path, _digest(path, payload) + payload, synced=False)
+            write_whole(path, _digest(path, payload) + payload, synced=False, contended=True)
         except OSError as error:
             self._warn("written", error)
 

@@ -142,7 +142,9 @@ def table_html(rows: Sequence[UnitRow]) -> str:
         notes = [row.reason] if row.reason else []
         if command := row.last_command:
             detail = f": {command.detail}" if command.code == "done" and command.detail else ""
-            notes.append(f"{command.verb}: {command.outcome or 'under way'}{detail}")
+            is_over = command.outcome is not None or command.code is not None
+            outcome = command.outcome or command.code if is_over else "under way"
+            notes.append(f"{command.verb}: {outcome}{detail}")
         if notes:
             bar = _progress_html(row.health.progress)
             parts.append(f'<tr><td class="why" colspan="8">{html.escape("; ".join(notes))}{bar}</td></tr>')

@@ -12,6 +12,7 @@ import numba
 import pytest
 
 from geometry.compilation import cache as jit_cache
+from geometry.compilation.prebuilt import PARTIAL
 from shared.errors import JitCacheError
 
 COMPILE = """
@@ -127,6 +128,24 @@ def test_each_state_of_the_kernels_has_a_folder_of_its_own(tmp_path: Path, monke
         os.utime(folders[-1], (state, state))
     assert len(set(folders)) == len(folders)
     assert sorted((tmp_path / "cache").iterdir()) == sorted(folders[-jit_cache.STATES_MAX :])
+
+
+def test_links_that_a_power_cut_left_half_made_cost_no_state_that_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jit_cache.os, "environ", dict(os.environ))
+    monkeypatch.setattr(numba.config, "CACHE_DIR", numba.config.CACHE_DIR)
+    kept = []
+    for state in range(jit_cache.STATES_MAX):
+        monkeypatch.setattr(jit_cache, "state_of_kernels", lambda state=state: f"{state:012x}")
+        kept.append(jit_cache.settle(tmp_path / "cache"))
+        os.utime(kept[-1], (1000 + state, 1000 + state))
+    left, being_made = (tmp_path / "cache" / f"{PARTIAL}{name}" for name in ("left", "being_made"))
+    left.mkdir()
+    os.utime(left, (1, 1))
+    being_made.mkdir()
+    jit_cache.settle(tmp_path / "cache")
+    assert sorted((tmp_path / "cache").iterdir()) == sorted([*kept, being_made])
 
 
 DAMAGE = {

@@ -6,6 +6,9 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import subprocess
+import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -137,7 +140,7 @@ def test_their_bytes_are_bounded_too(folder: Path, made: list[str], monkeypatch:
 def test_a_full_disk_is_a_warning_once(
     folder: Path, made: list[str], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def full(path: Path, content: bytes, *, synced: bool) -> None:
+    def full(path: Path, content: bytes, **how: bool) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(hull_store, "write_whole", full)
@@ -178,3 +181,46 @@ def test_the_state_of_the_code_tells_sources_and_libraries_apart(tmp_path: Path)
 def test_they_lie_beside_the_kernels(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels-0123456789ab"))
     assert folder_beside("hulls") == tmp_path / "hulls"
+
+
+def test_units_that_start_together_do_not_disturb_one_another(folder: Path) -> None:
+    """Each writes all hulls; no write fails by another's, and what is there in the end is whole."""
+    keep = """
+import logging, sys
+from pathlib import Path
+from geometry.rendering.hull_store import HullStore
+from shared.meshes import box_mesh
+logging.basicConfig(format="%(message)s")
+store = HullStore(Path(sys.argv[1]), "state")
+print("ready", flush=True)
+sys.stdin.readline()
+for number in range(150):
+    mesh = box_mesh("box", (0.1, 0.1, 0.1 + 0.001 * number))
+    store.save(mesh, 0.05, mesh)
+"""
+    with ExitStack() as stack:
+        units = [
+            stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-c", keep, str(folder)],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.PIPE,
+                    text=True,
+                )
+            )
+            for _ in range(3)
+        ]
+        for unit in units:
+            assert unit.stdout is not None
+            assert unit.stdout.readline() == "ready\n"
+        # communicate() would let the first begin alone.
+        for unit in units:
+            assert unit.stdin is not None
+            unit.stdin.write("go\n")
+            unit.stdin.flush()
+        said = [unit.communicate(timeout=60.0)[1] for unit in units]
+    assert said == ["", "", ""]
+    store = hull_store.HullStore(folder, "state")
+    assert all(store.load(box_mesh("box", (0.1, 0.1, 0.1 + 0.001 * number)), 0.05) for number in range(150))
+    assert not list(folder.glob("*.partial"))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import random
 import struct
 from collections.abc import Sequence
@@ -52,25 +53,30 @@ def _with_another_field(rng: random.Random, body: bytes) -> bytes:
         name = rng.choice([*fields, "unknown"])
         value = fields.get(name)
         if isinstance(value, list) and value and rng.random() < 0.7:
-            value[rng.randrange(len(value))] = rng.choice(VALUES)
+            value[rng.randrange(len(value))] = _value(rng)
         elif isinstance(value, bytes) and rng.random() < 0.5:
             fields[name] = _keys(rng)
         elif rng.random() < 0.2:
             fields.pop(name, None)
         else:
-            fields[name] = rng.choice(VALUES)
+            fields[name] = _value(rng)
     packed: bytes = msgpack.packb(fields)
     return packed
 
 
 def _with_nested(rng: random.Random, body: bytes) -> bytes:
     fields = msgpack.unpackb(body)
-    value: Any = rng.choice(VALUES)
+    value: Any = _value(rng)
     for _ in range(rng.choice((1, 10, 100, 400))):
         value = [value] if rng.random() < 0.5 else {"a": value}
     fields[rng.choice([*fields, "unknown"])] = value
     packed: bytes = msgpack.packb(fields)
     return packed
+
+
+def _value(rng: random.Random) -> Any:
+    """One of its own: a list that is put into a list of the next round must not come to hold itself."""
+    return copy.deepcopy(rng.choice(VALUES))
 
 
 def _keys(rng: random.Random) -> bytes:

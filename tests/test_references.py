@@ -17,6 +17,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.missing import need_command
+
 CHECKOUT = Path(__file__).resolve().parent.parent
 PACKAGES = ("shared", "geometry", "edge_unit", "master_server", "simulation", "benchmarks", "qualification", "tests")
 PACKAGE = "|".join(PACKAGES)
@@ -45,6 +47,7 @@ BESIDE = CHECKOUT.parent / "shared" / "data"
 @cache
 def tracked() -> tuple[Path, ...]:
     """Every text file of the project."""
+    need_command("git", "git")
     git = ("git", "-C", str(CHECKOUT), "ls-files", "-z", "--cached", "--others", "--exclude-standard")
     names = subprocess.run(git, capture_output=True, check=True, text=True).stdout.split("\0")
     files = []

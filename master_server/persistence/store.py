@@ -17,6 +17,7 @@ import logging
 import os
 import sqlite3
 import threading
+import weakref
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -153,7 +154,10 @@ class Store:
         """A store that forgets everything with its process."""
         connection = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
         connection.executescript(SCHEMA)
-        return cls(connection, ":memory:")
+        store = cls(connection, ":memory:")
+        # Nobody closes what has no file to let go of, and Python (3.13) warns of a connection that is left open.
+        weakref.finalize(store, connection.close)
+        return store
 
     @classmethod
     def open(cls, path: Path) -> Store:
@@ -166,7 +170,7 @@ class Store:
         try:
             if not path.exists():
                 _make(path)
-            connection = sqlite3.connect(path, LOCK_TIMEOUT_S, isolation_level=None, check_same_thread=False)
+            connection = sqlite3.connect(path, timeout=LOCK_TIMEOUT_S, isolation_level=None, check_same_thread=False)
         except (sqlite3.Error, OSError) as error:
             raise ConfigError(f"{path}: cannot open what the master keeps: {error}") from error
         try:

@@ -154,8 +154,10 @@ class FreshDebian:
         command = ("mmdebstrap", "--quiet", "--variant=minbase", f"--include={','.join(PACKAGES)}")
         try:
             subprocess.run((*command, self.suite, str(self.root)), check=True, timeout=DEBIAN_S)
-        except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
-            raise Unreachable(f"Debian {self.suite} cannot be fetched: {error}") from error
+        except subprocess.CalledProcessError as error:
+            raise Unreachable(f"Debian {self.suite} cannot be fetched; mmdebstrap has said why") from error
+        except subprocess.TimeoutExpired as error:
+            raise Unreachable(f"Debian {self.suite} cannot be fetched within {DEBIAN_S:g} s") from error
         for name, line in (
             ("passwd", f"{USER}:x:{USER_ID}:{USER_ID}::{HOME}:/bin/sh"),
             ("group", f"{USER}:x:{USER_ID}:"),

@@ -13,6 +13,7 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,14 @@ VOXELS = "process(), as far as the voxels"
 """Peers tell neither what is seen nor how well a frame fits, so this is what they are raced against."""
 
 Work = Callable[[int], object]
-"""Takes the number of a frame; returns nanoseconds where it measured a part of itself, else all of it counts."""
+"""Takes the number of a frame; returns a `Part` where only that counts."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Nanoseconds that a part of some work took."""
+
+    took_ns: int
 
 
 class Spent:
@@ -76,8 +84,8 @@ def in_turns(contenders: Mapping[str, Work], turns: int, frames: int = FRAMES) -
             took_ms = []
             for k in range(FRAMES_A_TURN):
                 began_ns = stage_ns()
-                part_ns = work((turn * FRAMES_A_TURN + k) % frames)
-                took_ns = part_ns if isinstance(part_ns, int) else stage_ns() - began_ns
+                found = work((turn * FRAMES_A_TURN + k) % frames)
+                took_ns = found.took_ns if isinstance(found, Part) else stage_ns() - began_ns
                 took_ms.append(took_ns / NS_PER_MS)
             if turn > 0:
                 spent[name].turns.append(took_ms)
@@ -214,9 +222,9 @@ def costs_by_size(recordings: Sequence[Recording], turns: int) -> tuple[dict[str
 def _to_voxels(pipeline: DepthPipeline, depth: NDArray[np.uint16], joints: NDArray[np.float64] | None = None) -> Work:
     """The stages that peers have, too: expected depth, foreground, voxels, density."""
 
-    def work(n: int) -> int:
+    def work(n: int) -> Part:
         times = pipeline.process(depth[n], None if joints is None else joints[n]).times
-        return times.expected_ns + times.foreground_ns + times.density_ns
+        return Part(times.expected_ns + times.foreground_ns + times.density_ns)
 
     return work
 

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import pipeline
 from benchmarks.peers.ur3_scene import room
-from benchmarks.pipeline import FRAMES_A_TURN, Spent, in_turns
+from benchmarks.pipeline import FRAMES_A_TURN, Part, Spent, in_turns
 from shared.transforms import look_at
 from simulation.cameras.camera import d435i_intrinsics
 
@@ -27,6 +27,13 @@ def test_contenders_take_turns_over_the_same_frames() -> None:
     assert done == [(name, n) for turn in each for name in "ab" for n in turn]
     assert [len(spent[name].turns) for name in "ab"] == [2, 2]
     assert all(len(turn) == FRAMES_A_TURN for turn in spent["a"].turns)
+
+
+def test_only_a_part_of_some_work_counts_where_it_says_so() -> None:
+    """A number that some work returns is none of its time."""
+    spent = in_turns({"part": lambda _n: Part(5_000_000), "number": lambda n: 5_000_000_000 + n}, turns=1, frames=4)
+    assert spent["part"].turns == [[5.0] * FRAMES_A_TURN]
+    assert max(spent["number"].turns[0]) < 5000.0
 
 
 def test_the_first_frame_of_a_turn_is_told_apart() -> None:

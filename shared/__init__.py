@@ -4,6 +4,7 @@
 In the order of the flow:
 
     errors         the one tree of errors that the project raises
+    text_files     text files as editors write them: tables, and YAML whose numbers are numbers
     configuration  YAML, environment and command line as one configuration
     files          files of which a power cut leaves all or nothing, and state in them
     clock          the only place that reads the time

@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from shared.errors import CellError
 from shared.joint_table import MAX_JOINTS
 from shared.meshes import MAX_COORDINATE_M
+from shared.text_files import parse_yaml, read_text
 from shared.transforms import Transform, from_xyz_rpy
 
 MAX_BODIES = 1000
@@ -195,13 +196,13 @@ def read_cell_file(path: str | Path) -> CellFile:
     """
     file = Path(path)
     try:
-        text = file.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise CellError(f"{file}: expected a YAML file in UTF-8, got other bytes: {error.reason}") from error
+        text = read_text(file)
+    except ValueError as error:
+        raise CellError(f"{file}: {error}") from error
     except OSError as error:
         raise CellError(f"{file}: expected a readable cell file, got: {error.strerror}") from error
     try:
-        content = yaml.load(text, Loader=_StrictLoader)
+        content = parse_yaml(text)
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark is not None else ""
         raise CellError(f"{file}: {line}expected YAML, got a fault: {error.problem}") from error
@@ -257,21 +258,6 @@ def _in_package(where: str, text: str) -> Path:
             return folders[0] / rest
         raise CellError(f"{where}: expected an installed package {package or '(no name)'}, for {text}") from error
     return located
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """YAML in which a key that stands twice is an error: the first one would be lost without a word."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
-        for key, _ in node.value:
-            text = str(key.value)
-            if text in seen:
-                raise yaml.constructor.ConstructorError(
-                    "while reading a mapping", node.start_mark, f"the key {text} stands there twice", key.start_mark
-                )
-            seen.add(text)
-        return super().construct_mapping(node, deep)
 
 
 def _sentence(problem: Mapping[str, Any]) -> str:

@@ -124,7 +124,10 @@ BAD = {
     ),
     "twice": ("static: []\nstatic: []\n", "line 4: expected YAML, got a fault: the key static stands there twice"),
     "scale": ("static: [{name: a, mesh: a.stl, scale: -1}]\n", "static[0].scale: expected greater than 0, got -1"),
-    "text": ("static: [{name: a, mesh: a.stl, scale: 1e-3}]\n", "static[0].scale: expected a number, got '1e-3'"),
+    "text": (
+        "static:\n  - name: a\n    mesh: a.stl\n    scale: 0,001\n",
+        "static[0].scale: expected a number, got '0,001'",
+    ),
     "truth": ("static: [{name: a, mesh: a.stl, scale: true}]\n", "static[0].scale: expected a number, got True"),
     "nan": ("static: [{name: a, box: [1, 1, .nan]}]\n", "static[0].box[2]: expected a finite number, got nan"),
     "pair": ("objects: [{name: a, box: [1, 1]}]\n", "objects[0].box[2]: expected a value, got none"),
@@ -164,7 +167,7 @@ BAD = {
     "no list": ("static: {a: 1}\n", "static: expected a list, got keys and values"),
     "no keys": ("robot: [1]\n", "robot: expected keys and values, got a list"),
     "nothing": ("static: [null]\n", "static[0]: expected keys and values, got nothing"),
-    "date": ("robot: {urdf: 2026-01-01}\n", "robot.urdf: expected text, got something else"),
+    "list": ("robot: {urdf: [a]}\n", "robot.urdf: expected text, got a list"),
     "yaml": ("static: [\n", "line 4: expected YAML, got a fault: expected the node content"),
 }
 
@@ -197,7 +200,7 @@ def test_every_problem_gets_its_own_sentence(tmp_path: Path) -> None:
     [
         (b"", "expected keys and values, got NoneType"),
         (b"- 1\n", "expected keys and values, got list"),
-        (b"\xff\xfe\x00", "expected a YAML file in UTF-8"),
+        (b"\xff\xfe\x00", "expected text in UTF-8"),
         (b"name: c\n", "box: expected a value, got none"),
         (b"!!python/object:os.system {}\n", "expected YAML, got a fault: could not determine a constructor"),
     ],

@@ -123,7 +123,7 @@ class RobotFile(_Model):
     """The robot: either a URDF or DH rows."""
 
     urdf: str | None = None
-    meshes: Literal["collision", "visual"] = "collision"
+    meshes: Literal["collision_or_visual", "collision", "visual"] = "collision_or_visual"
     joints: tuple[str, ...] | None = None
     held_joints: dict[str, Number] = Field(default_factory=dict)
     packages: dict[str, str] = Field(default_factory=dict)
@@ -229,19 +229,35 @@ def named_file(cell_file: Path, key: str, text: str) -> Path:
         CellError: the variable or the package is not there, or no such file is; names the key.
     """
     where = f"{cell_file}: {key}"
+    found = _named(cell_file, where, text)
+    if not found.is_file():
+        raise CellError(f"{where}: expected a file, got {'a folder' if found.is_dir() else 'nothing'} at {found}")
+    return found
+
+
+def named_folder(cell_file: Path, key: str, text: str) -> Path:
+    """Return the folder that a path in `cell.yaml` means, by the rules of `named_file`.
+
+    Raises:
+        CellError: the variable or the package is not there, or no such folder is; names the key.
+    """
+    where = f"{cell_file}: {key}"
+    found = _named(cell_file, where, text)
+    if not found.is_dir():
+        raise CellError(f"{where}: expected a folder, got {'a file' if found.is_file() else 'nothing'} at {found}")
+    return found
+
+
+def _named(cell_file: Path, where: str, text: str) -> Path:
     if text.startswith("package:"):
-        found = _in_package(where, text)
-    elif text.startswith("$"):
+        return _in_package(where, text)
+    if text.startswith("$"):
         variable, _, rest = text[1:].partition("/")
         variable = variable.removeprefix("{").removesuffix("}")
         if not os.environ.get(variable):
             raise CellError(f"{where}: expected the environment variable {variable} to be set, for {text}")
-        found = Path(os.environ[variable]) / rest
-    else:
-        found = cell_file.parent / text
-    if not found.is_file():
-        raise CellError(f"{where}: expected a file, got nothing at {found}")
-    return found
+        return Path(os.environ[variable]) / rest
+    return cell_file.parent / text
 
 
 def _in_package(where: str, text: str) -> Path:

@@ -150,7 +150,10 @@ BAD = {
         "robot: expected tool.parent only beside urdf",
     ),
     "no rows": ("robot: {dh: {joints: []}}\n", "robot.dh.joints: expected at least 1 entries, got 0"),
-    "meshes": ("robot: {urdf: r, meshes: hull}\n", "robot.meshes: expected 'collision' or 'visual', got 'hull'"),
+    "meshes": (
+        "robot: {urdf: r, meshes: hull}\n",
+        "robot.meshes: expected 'collision_or_visual', 'collision' or 'visual', got 'hull'",
+    ),
     "marker": (
         "board: {columns: 5, rows: 7, square_m: 0.04, marker_m: 0.04}\n",
         "board: expected marker_m below square_m = 0.04, got 0.04",
@@ -241,7 +244,7 @@ def test_every_form_of_path_finds_its_file(tmp_path: Path, monkeypatch: pytest.M
     ("text", "words"),
     [
         ("gone.stl", "k: expected a file, got nothing at"),
-        ("", "k: expected a file, got nothing at"),
+        ("", "k: expected a file, got a folder at"),
         ("$CELL_TEST_UNSET/a.stl", "k: expected the environment variable CELL_TEST_UNSET to be set, for $CELL_TEST"),
         ("package:no_such_wheel/a.stl", "k: expected an installed package no_such_wheel, for package:no_such_wheel"),
         ("package:", "k: expected an installed package (no name), for package:"),

@@ -245,10 +245,10 @@ def test_malformed_headers_are_refused(header: tuple[bytes, int, int, int], body
 
 
 BAD_FILES = {
-    "empty.stl": (b"", "expected a mesh with triangles, got none"),
+    "empty.stl": (b"", "expected an STL file of at least 84 bytes, got 0"),
     "hollow.stl": (b"solid x\nendsolid x\n", "expected a mesh with triangles, got none"),
-    "noise.stl": (bytes(range(200)), "expected a mesh with triangles, got none"),
-    "cut.stl": (b"\0" * 80 + struct.pack("<I", 9) + b"\0" * 50, "expected a mesh with triangles, got none"),
+    "noise.stl": (bytes(range(200)), "got 200; it is cut off, or no STL"),
+    "cut.stl": (b"\0" * 80 + struct.pack("<I", 9) + b"\0" * 50, "expected 534 bytes for 9 triangles, got 134"),
     "index.obj": (b"v 0 0 0\nf 1 2 3\n", "expected a readable mesh"),
     "header.ply": (b"ply\n", "expected a readable mesh"),
     "broken.dae": (b"<COLLADA>", "expected a readable mesh"),
@@ -303,3 +303,43 @@ def test_every_edge_of_a_box_is_shared() -> None:
     mesh = box_mesh("b", (1, 1, 1))
     edges = [tuple(sorted((int(f[i]), int(f[j])))) for f in mesh.faces for i, j in itertools.combinations(range(3), 2)]
     assert all(edges.count(edge) == 2 for edge in edges)
+
+
+def binary_stl(tmp_path: Path, *, header: bytes = b"", extra: int = 0, lost: int = 0) -> Path:
+    content = trimesh.creation.box(extents=(0.2, 0.3, 0.4)).export(file_type="stl")
+    assert isinstance(content, bytes)
+    file = tmp_path / "box.stl"
+    whole = header.ljust(80, b" ") + content[80:] + bytes(extra)
+    file.write_bytes(whole[: len(whole) - lost])
+    return file
+
+
+@pytest.mark.parametrize(("header", "extra"), [(b"", 0), (b"", 1), (b"", 10), (b"solid of a CAD", 0), (b"solid", 3)])
+def test_a_binary_stl_is_read_as_far_as_its_header_counts(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, header: bytes, extra: int
+) -> None:
+    mesh = load_mesh(binary_stl(tmp_path, header=header, extra=extra))
+    assert (len(mesh.faces), mesh.closed) == (12, True)
+    assert (f"passed over {extra} bytes" in caplog.text) == (extra > 0)
+
+
+def test_a_cut_off_stl_is_refused_with_its_bytes(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match="expected 684 bytes for 12 triangles, got 683; it is cut off"):
+        load_mesh(binary_stl(tmp_path, lost=1))
+    with pytest.raises(MeshError, match="at least 84 bytes, got 80"):
+        load_mesh(binary_stl(tmp_path, lost=604))
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".obj", ".dae"])
+def test_a_pointer_of_git_lfs_is_named_as_one(tmp_path: Path, suffix: str) -> None:
+    file = tmp_path / f"arm{suffix}"
+    file.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n")
+    with pytest.raises(MeshError, match="Git LFS pointer"):
+        load_mesh(file)
+
+
+def test_a_glb_is_read(tmp_path: Path) -> None:
+    trimesh.creation.box(extents=(0.2, 0.3, 0.4)).export(tmp_path / "box.glb")
+    mesh = load_mesh(tmp_path / "box.glb")
+    assert mesh.closed
+    np.testing.assert_allclose(mesh.bounds_m[1], (0.1, 0.15, 0.2), atol=1e-6)

@@ -71,7 +71,7 @@ class TriangleMesh:
         name: for messages; no part of the canonical bytes.
         vertices: (V, 3) float32, metres, mesh frame.
         faces: (F, 3) int32, indices into `vertices`.
-        closed: it bounds a volume and all its triangles face outwards.
+        closed: it bounds a volume and all its triangles face outwards, into a hollow inside as well.
     """
 
     name: str
@@ -128,7 +128,7 @@ class TriangleMesh:
         closed = _bounds_volume(triangles)
         points = merged.astype(np.float64)
         if closed:
-            triangles = _face_outwards(points, triangles)
+            triangles, closed = _face_outwards(points, triangles)
         a, b, c = points[triangles[:, 0]], points[triangles[:, 1]], points[triangles[:, 2]]
         areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
         triangles = triangles[areas > MIN_TRIANGLE_AREA_M2]
@@ -359,12 +359,36 @@ def _bounds_volume(faces: NDArray[np.int64]) -> bool:
     return bool(len(edges)) and not np.add.reduceat(direction, starts).any()
 
 
-def _face_outwards(points: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Turn over the parts of a closed surface whose volume comes out negative."""
+def _face_outwards(points: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], bool]:
+    """Turn the parts of a closed surface that face inwards, but for those that bound a hollow inside another part.
+
+    Returns the faces (F, 3), and False when a part was turned: a solid that was exported inside out, or a room that is
+    seen from inside. Which of them it is nobody can tell, so both its sides must be drawn.
+    """
     part = _connected_parts(len(points), faces)[faces[:, 0]]
     a, b, c = (points[faces[:, k]] for k in range(3))
     six_volumes = np.bincount(part, weights=np.einsum("ij,ij->i", a, np.cross(b, c)))
-    return np.where((six_volumes < 0.0)[part][:, None], faces[:, ::-1], faces)
+    inwards = [label for label in np.flatnonzero(six_volumes < 0.0) if not _is_hollow(points, faces, part, label)]
+    turned = np.isin(part, inwards)
+    return np.where(turned[:, None], faces[:, ::-1], faces), not turned.any()
+
+
+def _is_hollow(
+    points: NDArray[np.float64], faces: NDArray[np.int64], part: NDArray[np.int64], label: np.intp | int
+) -> bool:
+    """Return True if a part lies inside the other parts: the surfaces around it add up to a winding number of 1."""
+    own = part == label
+    inside = points[faces[own][0, 0]]
+    corners = points[faces[~own]] - inside
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    length_a, length_b, length_c = (np.linalg.norm(corners[:, k], axis=1) for k in range(3))
+    # The solid angle of each triangle (Van Oosterom and Strackee, 1983).
+    triple = np.einsum("ij,ij->i", a, np.cross(b, c))
+    rest = length_a * length_b * length_c
+    rest += np.einsum("ij,ij->i", a, b) * length_c
+    rest += np.einsum("ij,ij->i", b, c) * length_a
+    rest += np.einsum("ij,ij->i", c, a) * length_b
+    return bool(2.0 * np.arctan2(triple, rest).sum() / (4.0 * np.pi) > 0.5)
 
 
 def _connected_parts(vertex_count: int, faces: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -101,7 +101,7 @@ def test_inside_out_solids_are_turned_each_by_itself() -> None:
     away = np.add(vertices, (10.0, 0.0, 0.0))
     turned = np.concatenate((faces, faces[:, ::-1] + len(vertices)))
     mesh = TriangleMesh.of_triangles("two", np.concatenate((vertices, away)), turned)
-    assert mesh.closed
+    assert not mesh.closed
     assert volume_m3(mesh) == pytest.approx(12.0)
 
 
@@ -295,7 +295,7 @@ def test_order_of_triangles_does_not_matter_to_closedness(order: list[int], shif
     shuffled = np.roll(faces[list(order)], shift, axis=1)
     for inside_out in (False, True):
         mesh = TriangleMesh.of_triangles("b", vertices, shuffled[:, ::-1] if inside_out else shuffled)
-        assert mesh.closed
+        assert mesh.closed is not inside_out
         assert volume_m3(mesh) == pytest.approx(6.0)
 
 
@@ -343,3 +343,44 @@ def test_a_glb_is_read(tmp_path: Path) -> None:
     mesh = load_mesh(tmp_path / "box.glb")
     assert mesh.closed
     np.testing.assert_allclose(mesh.bounds_m[1], (0.1, 0.15, 0.2), atol=1e-6)
+
+
+def shell(size_m: float, *, inwards: bool = False, at_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a cube."""
+    cube = box_mesh("cube", (size_m, size_m, size_m))
+    return cube.vertices + np.float32((at_m, 0, 0)), cube.faces[:, ::-1] if inwards else cube.faces
+
+
+def joined(*shells: tuple[np.ndarray, np.ndarray]) -> TriangleMesh:
+    starts = np.cumsum([0] + [len(vertices) for vertices, _ in shells[:-1]])
+    return TriangleMesh.of_triangles(
+        "joined",
+        np.concatenate([vertices for vertices, _ in shells]),
+        np.concatenate([faces + start for (_, faces), start in zip(shells, starts, strict=True)]),
+    )
+
+
+def test_a_hollow_keeps_facing_inwards() -> None:
+    room = joined(shell(4.0), shell(3.0, inwards=True))
+    assert room.closed
+    assert volume_m3(room) == pytest.approx(64.0 - 27.0)
+    nested = joined(shell(4.0), shell(3.0, inwards=True), shell(1.0), shell(0.5, inwards=True))
+    assert nested.closed
+    assert volume_m3(nested) == pytest.approx(64.0 - 27.0 + 1.0 - 0.125)
+
+
+def test_a_hollow_in_one_part_of_many_is_found() -> None:
+    parts = [shell(1.0, at_m=2.0 * i) for i in range(20)]
+    mesh = joined(*parts, shell(0.5, inwards=True, at_m=14.0))
+    assert mesh.closed
+    assert volume_m3(mesh) == pytest.approx(20.0 - 0.125)
+
+
+def test_a_part_that_faces_inwards_is_turned_and_drawn_from_both_sides() -> None:
+    """It is a solid exported inside out, or a room's inner surface; the file cannot tell."""
+    for mesh, volume in (
+        (joined(shell(2.0, inwards=True)), 8.0),
+        (joined(shell(2.0), shell(1.0, inwards=True, at_m=5.0)), 9.0),
+    ):
+        assert not mesh.closed
+        assert volume_m3(mesh) == pytest.approx(volume)

@@ -161,11 +161,11 @@ class SoakSite(Site):
 
     async def start_soaked(self, index: int) -> None:
         """Start a unit before its camera."""
-        source = SimulatedSourceConfig(camera=index, handling=self.cameras[index] / IMAGE)
+        source = SimulatedSourceConfig(camera=index)
         if not self.tokens[index].exists():
             self.tokens[index].write_text(self.unit_token.read_text())
         document = {
-            "source": source.model_dump(mode="json", include={"kind", "camera", "handling"}),
+            "source": source.model_dump(mode="json", include={"kind", "camera"}),
             "master_url": f"http://{MASTER_IP if index == 0 else '127.0.0.1'}:{self.port}",
             "token_file": str(self.tokens[index]),
             "state_dir": str(self.state_dirs[index]),
@@ -174,7 +174,7 @@ class SoakSite(Site):
         config = self.folder / f"unit{index + 1}.yaml"
         config.write_text(yaml.safe_dump(document))
         child = await self.processes.start(
-            self._name(f"unit{index + 1}"), "qualification.soak_site.unit", str(config),
+            self._name(f"unit{index + 1}"), "qualification.soak_site.unit", str(config), str(self.cameras[index]),
             under=self._cable.under if index == 0 else (),
             variables=self._clocks[index + 1].environment,
         )  # fmt: skip

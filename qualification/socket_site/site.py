@@ -22,6 +22,7 @@ from shared.clock import NS_PER_S, monotonic_ns
 from shared.transforms import Transform
 from simulation.fleet.processes import Child, Processes
 from simulation.fleet.running_master import start_master
+from simulation.fleet.unit import MODULE as UNIT_MODULE
 from simulation.world.handling import LEFT_ALONE, Handling
 from simulation.world.world import DEMO_CELL
 
@@ -121,7 +122,7 @@ class PlugSite:
         token = folder / "token"
         token.write_text(self.unit_token.read_text())
         handling = folder / "handling.json"
-        source = SimulatedSourceConfig(camera=index, cameras=UNITS, knows_pose=False, handling=handling)
+        source = SimulatedSourceConfig(camera=index, cameras=UNITS, knows_pose=False)
         document = {
             "source": source.model_dump(mode="json", exclude_defaults=True) | {"kind": source.kind},
             "token_file": str(token),
@@ -131,9 +132,9 @@ class PlugSite:
         config.write_text(yaml.safe_dump(document, sort_keys=False))
         started_ns = monotonic_ns()
         child = await self.processes.start(
-            f"unit{number}", "edge_unit", "run", str(config),
+            f"unit{number}", UNIT_MODULE, str(config), "--handling", str(handling),
             under=socket.under,
-            # What it reports is recorded to be judged; its configuration has nothing of that.
+            # The reports are recorded for the judge; the unit's configuration does not mention it.
             variables={f"{UNIT_PREFIX}TRACE_PATH": str(folder / TRACE)},
         )  # fmt: skip
         unit = PluggedUnit(number, folder, socket, source, handling, child, started_ns)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks.latency_probe.unit CONFIG.YAML RING.NPY`: the edge unit with a camera that plays a ring of frames.
+"""`python -m benchmarks.latency_probe.unit CONFIG.YAML RING.NPY`: the edge unit with a camera that plays frames.
 
 All but the source is the installed daemon. `benchmarks.latency_probe.frames` renders the ring beforehand. The capture
 time of a frame is its due time.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`python -m qualification.soak_site.unit CONFIG.YAML FOLDER`: the edge unit with a camera that may be unplugged.
 
-All but the source is the installed daemon. The camera delivers the image that lies in `FOLDER` at the moment of capture.
-It is unplugged while the folder holds no image. The configuration names a simulated camera: a unit takes a recording
-for finished when it fails, but waits for a camera to come back.
+All but the source is the installed daemon. The camera delivers the image that lies in `FOLDER` at the time of capture.
+It is unplugged while the folder holds no image. The configuration names a simulated camera, not a recording: the source
+of a recording that fails is not opened again.
 """
 
 from __future__ import annotations

@@ -14,7 +14,6 @@ import pytest
 
 from edge_unit.sources.frame import DepthSource
 from edge_unit.sources.simulated import SimulatedSource, SimulatedSourceConfig
-from shared.settings import FilterSettings
 from simulation.fleet import unit
 from simulation.world.handling import Handling
 
@@ -63,10 +62,6 @@ def test_without_options_nothing_is_added(ran: Ran) -> None:
     assert unit.arguments_of(None, 0.03, None) == ()
     assert unit.main(["unit.yaml"]) == 3
     assert ran.arguments == ["run", "unit.yaml"]
-
-
-def test_the_truth_has_the_voxels_of_the_default_settings() -> None:
-    assert unit.VOXEL_SIZE_M == FilterSettings().voxel_size_m
 
 
 @pytest.mark.parametrize("value", ["3", "small", "nan"])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Waiting with a limit, without losing a cancellation; and being called at a time, by a clock that tests may set.
+"""Wait with a timeout without losing a cancellation, and call back at a time, by a clock that tests can replace.
 
-`asyncio.wait_for` of Python 3.11 and older swallows a cancellation that arrives together with what is waited for; a
-task that is woken thirty times a second then goes on for ever although it was told to end.
+`asyncio.wait_for` of Python 3.11 and older swallows a cancellation that arrives together with the result. A task that
+waits thirty times a second then runs for ever although it was cancelled.
 """
 
 from __future__ import annotations
@@ -16,36 +16,36 @@ from shared.clock import NS_PER_S, monotonic_ns
 
 
 class Timer(Protocol):
-    """A call that is still to come."""
+    """A scheduled call."""
 
     def cancel(self) -> None:
-        """It does not come."""
+        """Cancel the call."""
 
 
 class Clock(Protocol):
-    """A monotonic clock in nanoseconds that also calls back."""
+    """A monotonic clock in nanoseconds with timers."""
 
     def now_ns(self) -> int:
-        """The time."""
+        """Return the time in nanoseconds."""
 
     def call_at(self, at_ns: int, do: Callable[[], object]) -> Timer:
-        """Have `do` called at this time, or soon when it is past."""
+        """Schedule a call of `do` at this time, or at once when the time has passed."""
 
 
 class LoopClock:
-    """The machine's monotonic clock, with the timers of the event loop that runs."""
+    """The machine's monotonic clock, with the timers of the running event loop."""
 
     def now_ns(self) -> int:
-        """The time."""
+        """Return the time in nanoseconds."""
         return monotonic_ns()
 
     def call_at(self, at_ns: int, do: Callable[[], object]) -> Timer:
-        """Have `do` called at this time, or soon when it is past."""
+        """Schedule a call of `do` at this time, or at once when the time has passed."""
         return asyncio.get_running_loop().call_later(max(at_ns - monotonic_ns(), 0) / NS_PER_S, do)
 
 
 async def within(timeout_s: float, work: Coroutine[Any, Any, object]) -> bool:
-    """Whether `work` was done within `timeout_s`; what is not is cancelled. Its exceptions are raised."""
+    """Return True if `work` finished within `timeout_s`; cancel it otherwise. Its exceptions are raised."""
     task = asyncio.ensure_future(work)
     try:
         done, _ = await asyncio.wait((task,), timeout=timeout_s)
@@ -57,9 +57,9 @@ async def within(timeout_s: float, work: Coroutine[Any, Any, object]) -> bool:
 
 
 async def at_once_or_within(timeout_s: float, work: Coroutine[Any, Any, object]) -> bool:
-    """As `within`, for work that mostly need not wait at all: it then costs neither a task nor a turn of the loop.
+    """Do the same as `within`, without a task or a turn of the event loop for work that does not wait at all.
 
-    Up to its first wait, `work` runs in the caller's task.
+    `work` runs in the caller's task up to its first wait.
     """
     try:
         waits_for = work.send(None)
@@ -69,7 +69,7 @@ async def at_once_or_within(timeout_s: float, work: Coroutine[Any, Any, object])
 
 
 async def _resumed(work: Coroutine[Any, Any, object], waits_for: object) -> None:
-    """The rest of `work`, which has come to its first wait."""
+    """Run the rest of `work` after its first wait."""
     await _steps(work, waits_for)
 
 

@@ -57,8 +57,8 @@ from shared.messages import (
     Outcome,
     Phase,
     PoseQuality,
+    ReportedOrigin,
     SlotAnswer,
-    ToldOrigin,
     UpdateAnswer,
     UpdateRequest,
     Versions,
@@ -123,7 +123,7 @@ class _Presented(NamedTuple):
     """The camera to register with, and the pose that the master is told: `T_world_camera` and where it is from."""
 
     camera: CameraInfo
-    known_pose: tuple[Transform, ToldOrigin] | None
+    known_pose: tuple[Transform, ReportedOrigin] | None
 
 
 class Uplink:
@@ -180,7 +180,7 @@ class Uplink:
 
     # ------------------------------------------------------------------ what the unit calls
 
-    def set_camera(self, camera: CameraInfo, known_pose: tuple[Transform, ToldOrigin] | None) -> None:
+    def set_camera(self, camera: CameraInfo, known_pose: tuple[Transform, ReportedOrigin] | None) -> None:
         """This is the camera to register with; another one than before means registering again.
 
         `known_pose` (`T_world_camera` and where it is from) is told to the master, which may know better.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Waiting with a limit."""
+"""Waiting with a timeout."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from shared.waiting import at_once_or_within, within
 pytestmark = pytest.mark.alone
 
 
-async def test_done_or_not() -> None:
+async def test_within_returns_whether_the_work_finished() -> None:
     event = asyncio.Event()
     assert not await within(0.01, event.wait())
     event.set()
     assert await within(0.01, event.wait())
 
 
-async def test_what_need_not_wait_is_done_in_the_task_of_the_caller() -> None:
+async def test_work_that_does_not_wait_runs_in_the_task_of_the_caller() -> None:
     ran_in: list[asyncio.Task[object] | None] = []
     event = asyncio.Event()
 
@@ -33,7 +33,7 @@ async def test_what_need_not_wait_is_done_in_the_task_of_the_caller() -> None:
     assert ran_in == [asyncio.current_task()] * 2
 
 
-async def test_what_has_to_wait_goes_on_where_it_was() -> None:
+async def test_work_that_waits_continues_at_its_first_wait() -> None:
     first, second = asyncio.Event(), asyncio.Event()
     done: list[str] = []
 
@@ -60,7 +60,7 @@ async def test_errors_are_raised_at_once_and_later(waits: bool) -> None:
         await at_once_or_within(1.0, fail())
 
 
-async def test_what_waits_too_long_is_cancelled_where_it_waits() -> None:
+async def test_work_is_cancelled_at_its_wait_after_the_timeout() -> None:
     cancelled = asyncio.Event()
 
     async def work() -> None:
@@ -94,7 +94,7 @@ async def test_a_cancellation_that_arrives_together_with_the_event_is_not_lost()
     task = asyncio.create_task(wait_for_ever())
     await asyncio.sleep(0.01)
     event.set()
-    # One turn of the loop later the waiting is done and not yet told: here `asyncio.wait_for` loses the cancellation.
+    # One turn of the loop later the wait is done but not yet reported: here `asyncio.wait_for` loses the cancellation.
     for _ in range(2):
         await asyncio.sleep(0)
     task.cancel()
@@ -103,7 +103,7 @@ async def test_a_cancellation_that_arrives_together_with_the_event_is_not_lost()
     assert task.cancelled()
 
 
-async def test_what_is_not_done_in_time_is_cancelled() -> None:
+async def test_unfinished_work_is_cancelled() -> None:
     cancelled = asyncio.Event()
 
     async def work() -> None:

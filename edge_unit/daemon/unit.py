@@ -74,8 +74,8 @@ class Unit:
     ) -> None:
         """Read and open files, so make it before the event loop runs.
 
-        `clock` is the one that the source's frames have their times of. Without `client` the unit makes one, and
-        looks for the master itself.
+        `clock` is the clock of the source's `captured_at_ns`. Without `client` the unit makes one and searches for the
+        master.
 
         Raises:
             ConfigError: the trace cannot be written, or the configured pose cannot be read.

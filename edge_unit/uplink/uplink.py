@@ -143,7 +143,7 @@ class Uplink:
         """`on_sent` is told of each report how it reached the master; None: it never did.
 
         `search` tells where the master is; without, it is where the client was aimed at, for ever. `clock` is the
-        unit's; requests have their timeouts by the network's own clock.
+        unit's clock; the timeouts of requests are the client's own.
         """
         self._client = client
         self._time = clock

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine, Generator
+from functools import partial
 from types import coroutine
 from typing import Any, Protocol
 
@@ -44,16 +45,62 @@ class LoopClock:
         return asyncio.get_running_loop().call_later(max(at_ns - monotonic_ns(), 0) / NS_PER_S, do)
 
 
-async def within(timeout_s: float, work: Coroutine[Any, Any, object]) -> bool:
-    """Return True if `work` finished within `timeout_s`; cancel it otherwise. Its exceptions are raised."""
+LOOP_CLOCK = LoopClock()
+"""The clock of everything that gets no other one."""
+
+
+async def sleep(duration_s: float, clock: Clock) -> None:
+    """Wait `duration_s` by `clock`."""
+    over = asyncio.Event()
+    timer = _call_after(duration_s, over.set, clock)
+    try:
+        await over.wait()
+    finally:
+        timer.cancel()
+
+
+async def wait_set(event: asyncio.Event, timeout_s: float, clock: Clock) -> None:
+    """Wait until `event` is set, and set it after `timeout_s` by `clock`.
+
+    Cheaper than `within`: it takes one timer and no task.
+    """
+    timer = _call_after(timeout_s, event.set, clock)
+    try:
+        await event.wait()
+    finally:
+        timer.cancel()
+
+
+async def done_within(timeout_s: float, future: asyncio.Future[Any], clock: Clock) -> bool:
+    """Return True if `future` is done within `timeout_s` by `clock`; it goes on in either case."""
+    late = asyncio.get_running_loop().create_future()
+    timer = _call_after(timeout_s, partial(_end, late), clock)
+    try:
+        await asyncio.wait((future, late), return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        timer.cancel()
+    return future.done()
+
+
+async def within(timeout_s: float, work: Coroutine[Any, Any, object], clock: Clock = LOOP_CLOCK) -> bool:
+    """Return True if `work` is done within `timeout_s` by `clock`; cancel it if not. Its exceptions are raised."""
     task = asyncio.ensure_future(work)
     try:
-        done, _ = await asyncio.wait((task,), timeout=timeout_s)
+        done = await done_within(timeout_s, task, clock)
     finally:
         task.cancel()
     if done:
         task.result()
-    return bool(done)
+    return done
+
+
+def _call_after(duration_s: float, do: Callable[[], object], clock: Clock) -> Timer:
+    return clock.call_at(clock.now_ns() + round(duration_s * NS_PER_S), do)
+
+
+def _end(future: asyncio.Future[None]) -> None:
+    if not future.done():
+        future.set_result(None)
 
 
 async def at_once_or_within(timeout_s: float, work: Coroutine[Any, Any, object]) -> bool:

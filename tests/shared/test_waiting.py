@@ -7,7 +7,8 @@ import asyncio
 
 import pytest
 
-from shared.waiting import at_once_or_within, within
+from shared.waiting import at_once_or_within, done_within, sleep, wait_set, within
+from tests.set_clock import START_NS, S, SetClock
 
 pytestmark = pytest.mark.alone
 
@@ -115,3 +116,39 @@ async def test_unfinished_work_is_cancelled() -> None:
     assert not await within(0.01, work())
     await asyncio.sleep(0)
     assert cancelled.is_set()
+
+
+async def test_a_clock_that_is_set_ends_each_kind_of_wait() -> None:
+    clock, event = SetClock(), asyncio.Event()
+    never = asyncio.get_running_loop().create_future()
+    waits = (
+        sleep(2.0, clock),
+        wait_set(event, 2.0, clock),
+        done_within(2.0, never, clock),
+        within(2.0, asyncio.Event().wait(), clock),
+    )
+    tasks = [asyncio.create_task(wait) for wait in waits]
+    while len(clock.timers) < len(tasks):
+        await asyncio.sleep(0)
+    clock.go_to(START_NS + 2 * S - 1)
+    for _ in range(3):
+        await asyncio.sleep(0)
+    assert not any(task.done() for task in tasks)
+    clock.go_to(START_NS + 2 * S)
+    assert await asyncio.gather(*tasks) == [None, None, False, False]
+    assert event.is_set()
+    assert not never.done()
+
+
+async def test_what_ends_sooner_takes_its_call_back() -> None:
+    clock, event, done = SetClock(), asyncio.Event(), asyncio.get_running_loop().create_future()
+    event.set()
+    done.set_result(None)
+    await wait_set(event, 2.0, clock)
+    assert await done_within(2.0, done, clock)
+    assert await within(2.0, event.wait(), clock)
+    cancelled = asyncio.create_task(sleep(2.0, clock))
+    await clock.waited_for()
+    cancelled.cancel()
+    await asyncio.gather(cancelled, return_exceptions=True)
+    assert clock.due_ns() is None

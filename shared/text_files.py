@@ -129,7 +129,7 @@ class _Loader(yaml.SafeLoader):
             text = str(key.value)
             if text in seen:
                 raise yaml.constructor.ConstructorError(
-                    "while reading a mapping", node.start_mark, f"the key {text} stands there twice", key.start_mark
+                    "while reading a mapping", node.start_mark, f"duplicate key {text}", key.start_mark
                 )
             seen.add(text)
         return super().construct_mapping(node, deep)

@@ -58,7 +58,7 @@ class Mimic:
 
 @dataclass(frozen=True, eq=False)
 class UrdfJoint:
-    """A joint as the file has it; `T_parent_joint` is its `<origin>`, `axis` has unit length."""
+    """A joint of the file; `T_parent_joint` is its `<origin>`, and `axis` has unit length."""
 
     name: str
     kind: JointKind
@@ -126,7 +126,7 @@ def read_urdf(
 def _parse(file: Path) -> minidom.Element:
     """The `<robot>` of a file, without other tools' elements."""
     try:
-        # Without namespaces: files in use carry prefixes that they never declare.
+        # Without namespaces: existing files use prefixes that they never declare.
         document = expatbuilder.parse(str(file), namespaces=False)
     except OSError as error:
         raise KinematicsError(f"{file}: expected a readable URDF file, got {error.strerror}") from error
@@ -253,7 +253,7 @@ def _origin(where: str, element: minidom.Element) -> Transform:
 
 
 def _tree(file: Path, links: tuple[str, ...], joints: tuple[UrdfJoint, ...]) -> tuple[str, tuple[UrdfJoint, ...]]:
-    """The root link, and the joints in the order of the chain: depth first, siblings in the file's order."""
+    """Return the root link, and the joints in chain order: depth first, siblings in the file's order."""
     for what, names in (("link", links), ("joint", [joint.name for joint in joints])):
         twice = sorted({name for name in names if list(names).count(name) > 1})
         if twice:
@@ -264,7 +264,7 @@ def _tree(file: Path, links: tuple[str, ...], joints: tuple[UrdfJoint, ...]) -> 
             raise KinematicsError(f"{file}: expected one joint to hold link {joint.child}, got several")
     roots = [link for link in links if link not in children]
     if len(roots) != 1:
-        raise KinematicsError(f"{file}: expected one link that no joint holds, got {', '.join(roots) or 'none'}")
+        raise KinematicsError(f"{file}: expected one link that is no joint's child, got {', '.join(roots) or 'none'}")
     ordered: list[UrdfJoint] = []
     pending = [joint for joint in reversed(joints) if joint.parent == roots[0]]
     while pending:
@@ -273,7 +273,7 @@ def _tree(file: Path, links: tuple[str, ...], joints: tuple[UrdfJoint, ...]) -> 
         pending.extend(other for other in reversed(joints) if other.parent == joint.child)
     if len(ordered) != len(joints):
         lost = sorted({joint.name for joint in joints} - {joint.name for joint in ordered})
-        raise KinematicsError(f"{file}: expected all joints to hang on {roots[0]}, got a ring of {', '.join(lost)}")
+        raise KinematicsError(f"{file}: expected all joints below {roots[0]}, got a ring of {', '.join(lost)}")
     return roots[0], tuple(ordered)
 
 

@@ -68,7 +68,7 @@ def test_mesh_files_are_found(tmp_path: Path, uri: str) -> None:
     np.testing.assert_allclose(mesh.bounds_m[1], [1.0, 0.5, 0.5])
 
 
-def test_packages_are_told_or_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_packages_are_given_or_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     part(tmp_path / "elsewhere" / "meshes")
     file = urdf(
         tmp_path / "robot", link("base", PARTS.format(uri="package://some_robot_wheel/meshes/part.stl", scale=""))
@@ -84,7 +84,7 @@ def test_packages_are_told_or_installed(tmp_path: Path, monkeypatch: pytest.Monk
     assert "some_robot_wheel" not in sys.modules
 
 
-def test_order_is_depth_first_whatever_the_file_says(tmp_path: Path) -> None:
+def test_order_is_depth_first_for_any_order_of_the_file(tmp_path: Path) -> None:
     file = urdf(
         tmp_path,
         *(link(name) for name in "edcba"),
@@ -97,7 +97,7 @@ def test_order_is_depth_first_whatever_the_file_says(tmp_path: Path) -> None:
     assert (model.root, [each.name for each in model.joints]) == ("a", ["ab", "be", "ad", "dc"])
 
 
-def test_foreign_prefixes_and_comments_do_not_disturb(tmp_path: Path) -> None:
+def test_foreign_prefixes_and_comments_are_ignored(tmp_path: Path) -> None:
     file = urdf(
         tmp_path,
         "<!-- a -->",
@@ -137,14 +137,14 @@ BAD = {
         f"<robot name='r'>{TWO}{joint('j', 'a', 'b', '<origin xyz=' + chr(34) + '0 0 nan' + chr(34) + '/>')}</robot>",
         "joint j: origin xyz: expected 3 numbers, got '0 0 nan'",
     ),
-    "two roots": (f"<robot name='r'>{TWO}</robot>", "expected one link that no joint holds, got a, b"),
+    "two roots": (f"<robot name='r'>{TWO}</robot>", "expected one link that is no joint's child, got a, b"),
     "two parents": (
         f"<robot name='r'>{TWO}{link('c')}{joint('j', 'a', 'c')}{joint('k', 'b', 'c')}</robot>",
         "expected one joint to hold link c, got several",
     ),
     "ring": (
         f"<robot name='r'>{TWO}{link('c')}{joint('j', 'a', 'b')}{joint('k', 'b', 'a')}</robot>",
-        "expected all joints to hang on c, got a ring of j, k",
+        "expected all joints below c, got a ring of j, k",
     ),
     "twice": (
         f"<robot name='r'>{TWO}{link('c')}{joint('j', 'a', 'b')}{joint('j', 'a', 'c')}</robot>",

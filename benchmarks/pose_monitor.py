@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make bench-pose-monitor`: how soon a knocked or covered camera is told, and how often a still one is suspected.
+"""`make bench-pose-monitor`: measure the time until a knocked or covered camera is reported, and the rate of false
+alarms.
 
-Cameras of the demo cell with a D435i's faults, people who walk and reach before them, the robot moving. A false alarm
-is a look at which a camera that nobody touched is called moved or blind.
+The cameras of the demo cell have a D435i's faults. People walk and reach before them, and the robot moves. A false
+alarm is a check in which an untouched camera is reported as moved or blind.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ CAMERAS = 4
 TOLD_S_MAX = 2.0
 
 LOOKS_AFTER = 12
-"""A knock that was not told by then counts as missed: longer than `TOLD_S_MAX`."""
+"""Checks after a knock. A knock that is not reported by then counts as missed: longer than `TOLD_S_MAX`."""
 
 KNOCKS = {
     "turned by 1 degree": (np.radians(1.0), 0.0),
@@ -46,15 +47,15 @@ KNOCKS = {
     "covered": (0.0, 0.0),
     "dazzled over two thirds": (0.0, 0.0),
 }
-"""Turn in rad and shift in m, each in a random direction."""
+"""Rotation in rad and shift in m, each in a random direction."""
 
 COVERED = {"covered": 1.0, "dazzled over two thirds": 0.67}
-"""Share of the picture, from the left, in which nothing is measured."""
+"""Share of the image, from the left, that has no measurement."""
 
 
 @dataclass(frozen=True)
 class Told:
-    """What became of one camera: for each knock, seconds until it was told (NaN: never) and until it was over."""
+    """Results of one camera: per knock, seconds until it was reported (NaN: never) and until the report ended."""
 
     told_s: dict[str, list[float]]
     back_s: dict[str, list[float]]
@@ -63,7 +64,7 @@ class Told:
 
 
 class Watch:
-    """One camera, looked at as its unit does."""
+    """One camera, checked as its unit checks it."""
 
     def __init__(self, number: int, people: int, intrinsics: Intrinsics, folder: Path) -> None:
         self.world = World.demo(people=people, seed=number)
@@ -76,7 +77,7 @@ class Watch:
         self.t_s = 0.0
 
     def look(self, eye: SimulatedCamera, hidden: float = 0.0) -> str:
-        """One look; the reason why the view is not to be trusted, if there is one."""
+        """Run one check. Return the reason if the view is not trusted, else an empty text."""
         frame = eye.capture(self.t_s)
         depth = frame.depth
         if hidden:
@@ -88,11 +89,11 @@ class Watch:
         return verdict.reason
 
     def eye(self, knock: Transform) -> SimulatedCamera:
-        """The camera, hanging at `knock` beside its place."""
+        """Return the camera, displaced by `knock` from its place."""
         return SimulatedCamera(self.world, self.pose @ knock, self.intrinsics, seed=self.number)
 
     def seconds_until(self, told: bool, eye: SimulatedCamera, hidden: float) -> float:
-        """Until it is told that the view is not to be trusted, or that it is again."""
+        """Return the seconds until the view is reported as not trusted, or as trusted again."""
         for looks in range(1, LOOKS_AFTER + 1):
             if bool(self.look(eye, hidden)) == told:
                 return looks * PERIOD_S
@@ -100,7 +101,7 @@ class Watch:
 
 
 def watch(number: int, people: int, size: tuple[int, int], quiet_s: float, trials: int) -> Told:
-    """All about one camera."""
+    """Run all trials of one camera."""
     rng = np.random.default_rng(number)
     with tempfile.TemporaryDirectory(prefix="cellwatch-stance-") as folder:
         one = Watch(number, people, d435i_intrinsics(*size), Path(folder))
@@ -118,7 +119,7 @@ def watch(number: int, people: int, size: tuple[int, int], quiet_s: float, trial
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure; the table, the marks, and all of it as one line of JSON. Exit code 1 when a mark is missed."""
+    """Measure, then print the table, the marks and one line of JSON. The exit code is 1 when a mark is missed."""
     options = _parser().parse_args(arguments)
     jobs = [
         partial(watch, number, people, options.resolution, 3600.0 * options.hours / 2.0, options.trials)
@@ -166,7 +167,7 @@ def _direction(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _worst(seconds: NDArray[np.float64]) -> float:
-    """The longest, or as long as was waited for when it did not come to an end."""
+    """Return the longest time. A time that did not end counts as the longest wait."""
     return float(np.max(np.where(np.isnan(seconds), LOOKS_AFTER * PERIOD_S, seconds)))
 
 
@@ -177,13 +178,13 @@ def _size(text: str) -> tuple[int, int]:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="make bench-pose-monitor", description="Knocked, covered, and untouched cameras."
+        prog="make bench-pose-monitor", description="Measure knocked, covered and untouched cameras."
     )
-    parser.add_argument("--hours", type=float, default=0.1, help="of each of the four cameras, untouched (0.1)")
-    parser.add_argument("--trials", type=int, default=4, help="of each knock, camera and number of people (4)")
+    parser.add_argument("--hours", type=float, default=0.1, help="hours of each of the four cameras, untouched (0.1)")
+    parser.add_argument("--trials", type=int, default=4, help="trials of each knock, camera and number of people (4)")
     parser.add_argument("--resolution", type=_size, default=(424, 240), metavar="WxH", help="(424x240)")
-    parser.add_argument("--processes", type=int, default=2, help="at once (2)")
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for pose_monitor.json")
+    parser.add_argument("--processes", type=int, default=2, help="number of processes (2)")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="folder for pose_monitor.json")
     return parser
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks.latency_probe.unit CONFIG.YAML`: the edge unit before a camera that plays prepared frames.
+"""`python -m benchmarks.latency_probe.unit CONFIG.YAML`: the edge unit with a camera that plays prepared frames.
 
-All but the source is the daemon as it is installed. The frames are those of `frames`, in the file that the
-`handling` of its simulated camera names; a frame counts as taken at the moment at which it falls due.
+All but the source is the installed daemon. The frames come from `benchmarks.latency_probe.frames`, in the file that the
+`handling` of the simulated camera names. The capture time of a frame is the moment at which it falls due.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ class RingSource:
 
     async def open(self) -> CameraInfo:
         """See `DepthSource`."""
-        # All of it in memory: a disk would be measured with it.
+        # All frames are in memory, because a disk would be part of the measurement.
         self._frames = await asyncio.to_thread(np.load, self._ring)
         config = self._config
         pose = rig(World.demo(people=0).cell, config.cameras)[config.camera]
         return CameraInfo(config.serial, "Played D435i", d435i_intrinsics(config.width, config.height), pose)
 
     async def frames(self) -> AsyncGenerator[DepthFrame, None]:
-        """See `DepthSource`. Who is slow skips."""
+        """See `DepthSource`. A slow consumer skips frames."""
         frames, config = self._frames, self._config
         if frames is None:
-            raise SourceError("played camera: expected to be opened before its frames are read")
+            raise SourceError("played camera: expected open() before frames(); call it first")
         period_ns = round(NS_PER_S / config.fps)
         stride = round(RING_HZ / config.fps)
         first_ns = config.epoch_ns + round(camera_phase_s(config.camera, config.cameras) * NS_PER_S)
         last = -1
         while True:
             latest = (monotonic_ns() - first_ns) // period_ns
-            # The one that was taken while the reader was busy, or else the next.
+            # The frame that was taken while the consumer was busy, or else the next one.
             last = latest if latest > last >= 0 else max(latest, last) + 1
             due_ns = first_ns + last * period_ns
             await asyncio.sleep(max(due_ns - monotonic_ns(), 0) / NS_PER_S)
@@ -64,7 +64,7 @@ class RingSource:
 
 
 def ring_source(config: SimulatedSourceConfig) -> DepthSource:
-    """Make the camera that plays what lies at its `handling`."""
+    """Make the camera that plays the file named by `handling`."""
     assert config.handling is not None
     return RingSource(config, config.handling)
 

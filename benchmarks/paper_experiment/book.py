@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was measured, by contender, resolution, voxel size and number of cameras."""
+"""Measurements by contender, resolution, voxel size and number of cameras."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CONTENDERS = {
 
 
 class Key(NamedTuple):
-    """Which measurement."""
+    """Identifies one measurement."""
 
     contender: str
     resolution: str
@@ -43,7 +43,7 @@ class Key(NamedTuple):
 
 @dataclass(frozen=True)
 class Spread:
-    """Milliseconds of several refreshes."""
+    """Statistics in milliseconds over several refreshes."""
 
     median_ms: float
     p99_ms: float
@@ -53,13 +53,13 @@ class Spread:
 
 
 class Book:
-    """Collects milliseconds."""
+    """Collects the times of refreshes in milliseconds."""
 
     def __init__(self) -> None:
         self._samples: dict[Key, list[float]] = {}
 
     def add(self, contender: str, resolution: str, voxel_size_m: float, until_ms: Iterable[float]) -> None:
-        """What refreshes of one camera, two, and so on took in one round."""
+        """Add the times of one round: the refresh of one camera, of two, and so on."""
         for cameras, value in enumerate(until_ms, 1):
             self._samples.setdefault(Key(contender, resolution, in_mm(voxel_size_m), cameras), []).append(value)
 
@@ -67,26 +67,26 @@ class Book:
         return key in self._samples
 
     def spread(self, key: Key) -> Spread:
-        """What was measured under `key`.
+        """Return the statistics of `key`.
 
         Raises:
-            KeyError: nothing was.
+            KeyError: nothing was measured.
         """
         values = self._samples[key]
         median, p99 = np.percentile(values, (50, 99))
         return Spread(float(median), float(p99), min(values), max(values), len(values))
 
     def median(self, contender: str, resolution: str, voxel_mm: int, cameras: int) -> float:
-        """In milliseconds; NaN where nothing was measured."""
+        """Return a median in milliseconds; NaN if nothing was measured."""
         key = Key(contender, resolution, voxel_mm, cameras)
         return self.spread(key).median_ms if key in self else float("nan")
 
     def __iter__(self) -> Iterator[Key]:
-        """All measurements, in the order in which they were begun."""
+        """Iterate over all measurements, in the order in which they were begun."""
         return iter(self._samples)
 
     def rows(self) -> list[dict[str, Any]]:
-        """All of it as plain values."""
+        """Return all measurements as plain values."""
         found = []
         for key in self._samples:
             spread = self.spread(key)
@@ -96,5 +96,5 @@ class Book:
 
 
 def in_mm(voxel_size_m: float) -> int:
-    """A voxel's edge as people say it."""
+    """Return a voxel's edge in whole millimetres."""
     return round(1e3 * voxel_size_m)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One unit as a process: is told which frame it sees, filters it, and reports it by the units' own client."""
+"""One unit as a process: it gets the number of a frame, filters the frame, and reports it by the units' own client."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from simulation.fleet.processes import die_with_parent
 
 @dataclass(frozen=True, eq=False)
 class Watch:
-    """Go on with another camera: `frames` is an npy file of (N, H, W) uint16, `joints` (N, n) rad are theirs."""
+    """Switch to another camera: `frames` is an npy file of (N, H, W) uint16, `joints` (N, n) rad belong to them."""
 
     intrinsics: Intrinsics
     T_world_camera: Transform
@@ -34,24 +34,24 @@ class Watch:
 
 @dataclass(frozen=True)
 class Resize:
-    """Go on with voxels of another size, and register anew."""
+    """Change the voxel size, and register again."""
 
     voxel_size_m: float
 
 
 @dataclass(frozen=True)
 class Look:
-    """Filter frame `number` and report it; None: report that nothing unknown is there."""
+    """Filter frame `number` and report it. None: report that nothing unknown is there."""
 
     number: int | None
 
 
 Order = Watch | Resize | Look | None
-"""What a unit is told to do; it says True when that is done. None: come to an end."""
+"""Command to a unit, which answers True when it is done. None: end."""
 
 
 def run(orders: Connection, url: str, token: str, number: int) -> None:
-    """Do what is asked until told to end."""
+    """Execute commands until the one that ends the process."""
     die_with_parent()
     asyncio.run(_Unit(orders, Member.at(url, token, number)).run())
 
@@ -63,7 +63,7 @@ class _Unit:
 
     async def run(self) -> None:
         async with self._member.client:
-            # Nothing else waits for this loop: it may stand still until there is something to do.
+            # Nothing else runs in this loop, so it may block until a command comes.
             while (order := self._orders.recv()) is not None:
                 await self._obey(order)
                 self._orders.send(True)
@@ -75,7 +75,7 @@ class _Unit:
         elif isinstance(order, Resize):
             self._work.resize(order.voxel_size_m)
             await self._member.register(self._watch.intrinsics, self._watch.T_world_camera)
-            # Compiles what is not yet, and leaves the connection open.
+            # Compiles the missing kernels, and leaves the connection open.
             self._work.look(self._depth[0], self._watch.joints[0])
             await self._member.tell(None, monotonic_ns())
         elif order.number is None:

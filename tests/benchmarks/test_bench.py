@@ -25,9 +25,8 @@ def part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, limit_s: 
     """A part whose module is `source`."""
     folder = tmp_path / "modules"
     folder.mkdir()
-    (folder / "made_part.py").write_text(source)
+    (folder / "made.py").write_text(source)
     monkeypatch.setenv("PYTHONPATH", f"{folder}:{ROOT}")
-    monkeypatch.setattr(Part, "runs", "made_part")
     return Part("made", "made", "Made", "Is it?", limit_s=limit_s, arguments=(str(tmp_path),))
 
 
@@ -46,13 +45,13 @@ def test_a_result_of_before_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_a_part_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = part(tmp_path, monkeypatch, "import threading; threading.Event().wait()", limit_s=0.5)
     found = run(made, tmp_path)
-    assert found["trouble"] == "it did not end within 0.5 s"
+    assert found["trouble"] == "not finished within 0.5 s"
     assert found["seconds"] < 10.0
 
 
 @pytest.mark.parametrize("each", PARTS, ids=lambda each: each.name)
 def test_each_part_is_a_module_and_a_target_of_make(each: Part) -> None:
-    assert importlib.util.find_spec(each.runs) is not None
+    assert importlib.util.find_spec(each.module) is not None
     assert re.search(rf"^{each.target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
 
 

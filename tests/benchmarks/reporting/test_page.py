@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.reporting.page import MARKS_OPEN_MAX, ROWS_OPEN_MAX, marks_in, write_page
+from benchmarks.reporting.page import BASELINE, MARKS_OPEN_MAX, REPORT, ROWS_OPEN_MAX, marks_in, write_page
 from benchmarks.reporting.parts import PARTS
 from benchmarks.reporting.report import Curves, Mark, Result, write
 
@@ -89,3 +89,8 @@ def test_curves_become_a_picture_that_stays_the_same(results: Path) -> None:
 
 def test_a_result_without_marks_has_none() -> None:
     assert list(marks_in({"rows": [1, {"marks": []}], "marks": ["not one"]})) == []
+
+
+def test_the_checked_in_page_is_the_one_of_the_baseline(tmp_path: Path) -> None:
+    write_page((BASELINE,), tmp_path / "REPORT.md")
+    assert REPORT.read_text() == (tmp_path / "REPORT.md").read_text()

@@ -54,11 +54,11 @@ def test_a_fault_that_is_noticed_and_gone_is_told_with_its_times() -> None:
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (at(11.0, GOOD), "free although there is the newcomer"),
-        (at(11.0, replace(STALE, free=HERE)), "free although there is the resident of camera 1"),
+        (at(11.0, GOOD), "free although it holds the newcomer"),
+        (at(11.0, replace(STALE, free=HERE)), "free although it holds the resident of camera 1"),
         (at(11.0, replace(BACK, held=HERE)), "complete without the newcomer"),
         (at(11.0, replace(BACK, units_live=1)), "complete with 1 of 2 units"),
-        (at(11.0, BACK), "complete while nobody could know"),
+        (at(11.0, BACK), "complete although the fault hid the state"),
         (at(13.5, replace(BACK, held=frozenset(), free=frozenset())), "complete without the newcomer"),
     ],
 )

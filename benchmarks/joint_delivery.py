@@ -28,7 +28,7 @@ CLOCK_UNCERTAINTY_NS = NS_PER_S // 1000
 class Delivery:
     """Delivery of samples: late by `delay_s` plus a mean of `jitter_s` (exponential); `lost_share` of them are lost.
 
-    Without `stamped` samples carry no time, and the time of arrival counts. The unit is configured with `told_delay_s`.
+    Without `stamped` samples carry no time, and the time of arrival counts. The unit corrects by `configured_delay_s`.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Delivery:
     lost_share: float = 0.0
     stamped: bool = True
     velocities: bool = True
-    told_delay_s: float = 0.0
+    configured_delay_s: float = 0.0
 
 
 class Delivered:
@@ -60,10 +60,10 @@ class Delivered:
         self._master = RobotJoints(tuple(f"joint_{i}" for i in range(len(joints))))
         self._unit = JointHistory()
 
-    def joints_at(self, captured_s: float, asked_s: float, stale_after_s: float) -> JointEstimate | None:
-        """Return the unit's estimate, at `asked_s`, of the joints at `captured_s`."""
+    def joints_at(self, captured_s: float, queried_s: float, stale_after_s: float) -> JointEstimate | None:
+        """Return the unit's estimate, at `queried_s`, of the joints at `captured_s`."""
         delivery = self._delivery
-        while self._coming and self._coming[0][0] <= asked_s:
+        while self._coming and self._coming[0][0] <= queried_s:
             arrives_s, at_s = self._coming.popleft()
             self._master.put(
                 JointsRequest(
@@ -74,7 +74,7 @@ class Delivered:
                 _ns(arrives_s),
             )
         self._unit.add(self._master.since(self._unit.newest_ns))
-        return self._unit.at(_ns(captured_s + delivery.told_delay_s), CLOCK_UNCERTAINTY_NS, stale_after_s)
+        return self._unit.at(_ns(captured_s + delivery.configured_delay_s), CLOCK_UNCERTAINTY_NS, stale_after_s)
 
 
 def _ns(t_s: float) -> int:

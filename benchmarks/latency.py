@@ -44,7 +44,7 @@ SIZES = ((424, 240), (848, 480))
 RATES_HZ = (15.0, 30.0)
 SECONDS, SETTLE_S = 8.0, 2.0
 
-ASK_S = 0.02
+POLL_S = 0.02
 """Period of a planner that polls 50 times a second."""
 
 START_S = 60.0
@@ -193,7 +193,7 @@ class Bench:
         await self._all_live(url, (master, robot, *units))
         await asyncio.sleep(SETTLE_S)
         readers = await self._start(
-            "readers", "benchmarks.load_generator.map_readers", url, operator, str(ASK_S), str(result)
+            "readers", "benchmarks.load_generator.map_readers", url, operator, str(POLL_S), str(result)
         )
         await until_written(readers, result.with_suffix(BEGUN), START_S)
         began_ns = monotonic_ns()

@@ -83,9 +83,9 @@ async def measure(amount: Amount) -> Found:
     book, same = Book(), Book()
     parts: list[composed.Parts] = []
     cores = sorted(os.sched_getaffinity(0))
-    with tempfile.TemporaryDirectory(prefix="cellwatch-paper-") as scratch, _told("all of it"):
+    with tempfile.TemporaryDirectory(prefix="cellwatch-paper-") as scratch, _timed("all of it"):
         folder = Path(scratch)
-        with _told("frames rendered"):
+        with _timed("frames rendered"):
             seen = [views(*size, amount.frames) for size in amount.resolutions]
         write_cell(seen[0].cell, folder / "cell.yaml")
         async with Processes(folder / "logs", without=(MASTER_PREFIX,)) as processes:
@@ -94,16 +94,16 @@ async def measure(amount: Amount) -> Found:
             os.sched_setaffinity(0, {cores[0]})
             try:
                 for each in seen:
-                    with _told(f"{each.name}, composed and centralised"):
+                    with _timed(f"{each.name}, composed and centralised"):
                         bench = composed.Bench(site, each, UNITS_COMPOSED, book)
                         parts += await bench.run(amount.sizes_m, amount.rounds, amount.octree_rounds)
-                with _told("all cameras with the same frames"):
+                with _timed("all cameras with the same frames"):
                     bench = composed.Bench(site, seen[-1].of_one(0), UNITS_SAME_FRAMES, same)
                     (same_parts,) = await bench.run((VOXEL_M,), amount.same_rounds, {})
             finally:
                 os.sched_setaffinity(0, cores)
             site.pin(set(cores))
-            with _told("units as processes"):
+            with _timed("units as processes"):
                 await _run_units(site, seen, folder, amount, book)
     return Found(book, parts, same, same_parts)
 
@@ -197,7 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @contextmanager
-def _told(what: str) -> Iterator[None]:
+def _timed(what: str) -> Iterator[None]:
     """Print the duration of the block when it is done."""
     began_ns = monotonic_ns()
     yield

@@ -31,10 +31,10 @@ from simulation.world.world import World
 
 CAMERAS = 4
 
-TOLD_S_MAX = 2.0
+REPORTED_S_MAX = 2.0
 
-LOOKS_AFTER = 12
-"""Checks after a knock. A knock that is not reported by then counts as missed: longer than `TOLD_S_MAX`."""
+CHECKS_AFTER = 12
+"""Checks after a knock. A knock that is not reported by then counts as missed: longer than `REPORTED_S_MAX`."""
 
 KNOCKS = {
     "turned by 1 degree": (np.radians(1.0), 0.0),
@@ -54,16 +54,16 @@ COVERED = {"covered": 1.0, "dazzled over two thirds": 0.67}
 
 
 @dataclass(frozen=True)
-class Told:
+class KnockTimes:
     """Results of one camera: per knock, seconds until it was reported (NaN: never) and until the report ended."""
 
-    told_s: dict[str, list[float]]
+    reported_s: dict[str, list[float]]
     back_s: dict[str, list[float]]
     quiet_looks: int
     alarms: list[str]
 
 
-class Watch:
+class WatchedCamera:
     """One camera, checked as its unit checks it."""
 
     def __init__(self, number: int, people: int, intrinsics: Intrinsics, folder: Path) -> None:
@@ -76,7 +76,7 @@ class Watch:
         self.stance.begin("here")
         self.t_s = 0.0
 
-    def look(self, eye: SimulatedCamera, hidden: float = 0.0) -> str:
+    def check(self, eye: SimulatedCamera, hidden: float = 0.0) -> str:
         """Run one check. Return the reason if the view is not trusted, else an empty text."""
         frame = eye.capture(self.t_s)
         depth = frame.depth
@@ -92,30 +92,30 @@ class Watch:
         """Return the camera, displaced by `knock` from its place."""
         return SimulatedCamera(self.world, self.pose @ knock, self.intrinsics, seed=self.number)
 
-    def seconds_until(self, told: bool, eye: SimulatedCamera, hidden: float) -> float:
+    def seconds_until(self, reported: bool, eye: SimulatedCamera, hidden: float) -> float:
         """Return the seconds until the view is reported as not trusted, or as trusted again."""
-        for looks in range(1, LOOKS_AFTER + 1):
-            if bool(self.look(eye, hidden)) == told:
-                return looks * PERIOD_S
+        for checks in range(1, CHECKS_AFTER + 1):
+            if bool(self.check(eye, hidden)) == reported:
+                return checks * PERIOD_S
         return float("nan")
 
 
-def watch(number: int, people: int, size: tuple[int, int], quiet_s: float, trials: int) -> Told:
+def watch(number: int, people: int, size: tuple[int, int], quiet_s: float, trials: int) -> KnockTimes:
     """Run all trials of one camera."""
     rng = np.random.default_rng(number)
     with tempfile.TemporaryDirectory(prefix="cellwatch-stance-") as folder:
-        one = Watch(number, people, d435i_intrinsics(*size), Path(folder))
+        one = WatchedCamera(number, people, d435i_intrinsics(*size), Path(folder))
         still = one.eye(np.eye(4))
-        quiet = [one.look(still) for _ in range(max(round(quiet_s / PERIOD_S), BASELINE_LOOKS_MAX))]
-        told_s: dict[str, list[float]] = {name: [] for name in KNOCKS}
+        quiet = [one.check(still) for _ in range(max(round(quiet_s / PERIOD_S), BASELINE_LOOKS_MAX))]
+        reported_s: dict[str, list[float]] = {name: [] for name in KNOCKS}
         back_s: dict[str, list[float]] = {name: [] for name in KNOCKS}
         for name, (turn_rad, shift_m) in KNOCKS.items():
             for _ in range(trials):
                 knock = from_xyz_rpy(shift_m * _direction(rng), turn_rad * _direction(rng))
-                told_s[name].append(one.seconds_until(True, one.eye(knock), COVERED.get(name, 0.0)))
+                reported_s[name].append(one.seconds_until(True, one.eye(knock), COVERED.get(name, 0.0)))
                 back_s[name].append(one.seconds_until(False, still, 0.0))
                 one.t_s += float(rng.uniform(0.0, 20.0))
-        return Told(told_s, back_s, len(quiet), [reason for reason in quiet if reason])
+        return KnockTimes(reported_s, back_s, len(quiet), [reason for reason in quiet if reason])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -127,26 +127,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for number in range(CAMERAS)
     ]
     with runner(options.processes) as run:
-        found: list[Told] = run(jobs)
+        found: list[KnockTimes] = run(jobs)
     rows = []
     marks = []
     for name in KNOCKS:
-        told = np.array([seconds for one in found for seconds in one.told_s[name]])
+        reported = np.array([seconds for one in found for seconds in one.reported_s[name]])
         back = np.array([seconds for one in found for seconds in one.back_s[name]])
-        late = float(np.mean(~(told <= TOLD_S_MAX)))
-        rows.append((name, len(told), float(np.nanmedian(told)), float(np.nanmax(told)), 100.0 * late, _worst(back)))
-        marks.append(Mark(f"{name}: % not told within {TOLD_S_MAX:g} s", 100.0 * late, at_most=0.0))
+        late = float(np.mean(~(reported <= REPORTED_S_MAX)))
+        rows.append(
+            (name, len(reported), float(np.nanmedian(reported)), float(np.nanmax(reported)), 100.0 * late, _worst(back))
+        )
+        marks.append(Mark(f"{name}: % not reported within {REPORTED_S_MAX:g} s", 100.0 * late, at_most=0.0))
     hours = sum(one.quiet_looks for one in found) * PERIOD_S / 3600.0
     alarms = [reason for one in found for reason in one.alarms]
     marks.append(Mark("false alarms, looks", float(len(alarms)), at_most=0.0))
     size = "{}x{}".format(*options.resolution)
-    looks = f"{len(alarms)} of {round(hours * 3600.0 / PERIOD_S)} looks in {hours:.2f} camera hours were false alarms"
+    checks = f"{len(alarms)} of {round(hours * 3600.0 / PERIOD_S)} checks in {hours:.2f} camera hours were false alarms"
     result = Result(
         f"Cameras knocked, covered and dazzled while one or two people walk, {size}",
         ("what", "trials", "told s, median", "worst", "% late", "over s, worst"),
         tuple(rows),
         tuple(marks),
-        (looks, *sorted(set(alarms))),
+        (checks, *sorted(set(alarms))),
     )
     print(result)
     document = result.document() | {
@@ -168,7 +170,7 @@ def _direction(rng: np.random.Generator) -> NDArray[np.float64]:
 
 def _worst(seconds: NDArray[np.float64]) -> float:
     """Return the longest time. A time that did not end counts as the longest wait."""
-    return float(np.max(np.where(np.isnan(seconds), LOOKS_AFTER * PERIOD_S, seconds)))
+    return float(np.max(np.where(np.isnan(seconds), CHECKS_AFTER * PERIOD_S, seconds)))
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -188,7 +190,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-assert LOOKS_AFTER > WINDOW
+assert CHECKS_AFTER > WINDOW
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -79,8 +79,8 @@ def paths() -> dict[str, JointPath]:
 def deliveries() -> tuple[Delivery, ...]:
     """Return the kinds of joint delivery; the first two are the usual ones."""
     late = Delivery("125 Hz, 40 ms late, with times")
-    arrival = Delivery("125 Hz, 40 ms late, no times", stamped=False, told_delay_s=0.04)
-    jittery = replace(arrival, jitter_s=0.01, told_delay_s=0.05)
+    arrival = Delivery("125 Hz, 40 ms late, no times", stamped=False, configured_delay_s=0.04)
+    jittery = replace(arrival, jitter_s=0.01, configured_delay_s=0.05)
     slow = replace(late, rate_hz=30.0)
     return (
         late,
@@ -94,7 +94,7 @@ def deliveries() -> tuple[Delivery, ...]:
         replace(jittery, name="no times, jitter 10 ms"),
         replace(jittery, name="no times, jitter 10 ms, no velocities", velocities=False),
         replace(arrival, name="no times, 30 Hz, jitter, 5 % lost", rate_hz=30.0, jitter_s=0.01, lost_share=0.05,
-                told_delay_s=0.05),
+                configured_delay_s=0.05),
     )  # fmt: skip
 
 
@@ -104,7 +104,7 @@ WORST = ("30 Hz, jitter, 5 % lost, no velocities", "no times, jitter 10 ms, no v
 DELAYS_S = (0.0, 0.02, 0.043, 0.08, 0.12)
 """True delays, which the estimate must find."""
 
-LOOK_S = 0.5
+FRAME_SPACING_S = 0.5
 """Time between two frames of the delay estimate in a running unit. The estimate uses as many as the unit keeps."""
 
 DELAY_ERROR_MAX_S = 0.005
@@ -112,7 +112,7 @@ DELAY_ERROR_MAX_S = 0.005
 RIG_CAMERA = 1
 """A camera at a corner of the cell, at twice the distance."""
 
-UNTOLD = Delivery("no times, 40 ms late, delay not told", stamped=False)
+UNCONFIGURED = Delivery("no times, 40 ms late, delay not told", stamped=False)
 """Result if nobody sets `joint_delay_s`; it has no mark."""
 
 
@@ -287,7 +287,7 @@ def find_delays(name: str, at_corner: bool, looks: int, intrinsics: Intrinsics) 
     static_m = DepthPipeline(intrinsics, pose, world.cell, settings).expected_depth(None)
     assert world.cell.robot is not None
     look = DelayLook(intrinsics, pose, world.cell.robot, static_m, settings)
-    frames = [(camera.capture(number * LOOK_S).depth, number * LOOK_S) for number in range(looks)]
+    frames = [(camera.capture(number * FRAME_SPACING_S).depth, number * FRAME_SPACING_S) for number in range(looks)]
     found = []
     for delay_s in DELAYS_S:
         late = partial(_late, path, delay_s)
@@ -322,7 +322,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 2), help="number of processes")
     options = parser.parse_args(arguments)
     bound = [delivery.name for delivery in deliveries()]
-    cases = [(delivery, 0.0) for delivery in (*deliveries(), UNTOLD)]
+    cases = [(delivery, 0.0) for delivery in (*deliveries(), UNCONFIGURED)]
     cases += [(delivery, HOLD_S) for delivery in deliveries() if delivery.name in (bound[0], *WORST)]
     jobs = [partial(watch, name, cases, options.frames, d435i_intrinsics(), Settings()) for name in paths()]
     with runner(options.processes) as run:

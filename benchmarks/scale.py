@@ -46,7 +46,7 @@ VOXELS = 300
 
 SECONDS, WARM_UP_S = 4.0, 1.0
 
-ASK_S = 0.02
+POLL_S = 0.02
 """Period of a planner that polls 50 times a second."""
 
 FULL_HZ, FULL_UNITS = 30.0, 50
@@ -91,14 +91,14 @@ class Row:
     """One step, and its effect on the readers."""
 
     step: Step
-    asked: Ages
+    polled: Ages
     streamed: Ages
     wide: bool
 
     @property
     def carried(self) -> bool:
         """Return True if all updates arrived, the map was right, and no view in it went stale."""
-        oldest_ms = np.max((self.asked.oldest_p99, self.streamed.oldest_p99))
+        oldest_ms = np.max((self.polled.oldest_p99, self.streamed.oldest_p99))
         return not (self.step.lost or self.step.map_wrong) and bool(oldest_ms < 1e3 * Settings().stale_after_s)
 
 
@@ -136,7 +136,7 @@ class Bench:
             "benchmarks.load_generator.map_readers",
             url,
             operator,
-            str(ASK_S),
+            str(POLL_S),
             str(folder / "read"),
         )
         await until_written(readers, folder / f"read{BEGUN}", READY_S)
@@ -162,8 +162,10 @@ class Bench:
         rows = []
         for step in (Step(**fields) for fields in found if "refused" not in fields):
             merged = np.load(f"{result}.{step.units}-{step.rate_hz:g}.npz")["merged"]
-            asked, streamed = (ages(merged, readings[name], step.begin_ns, step.end_ns) for name in (ASKING, LISTENING))
-            rows.append(Row(step, asked, streamed, module != "master_server"))
+            polled, streamed = (
+                ages(merged, readings[name], step.begin_ns, step.end_ns) for name in (ASKING, LISTENING)
+            )
+            rows.append(Row(step, polled, streamed, module != "master_server"))
         return rows, next((fields for fields in found if "refused" in fields), None)
 
 
@@ -233,17 +235,17 @@ def age_result(rows: Sequence[Row]) -> Result:
         "streamed: maps", "youngest ms ", "oldest ms ", "oldest p99 ",
     )  # fmt: skip
     table = [
-        (row.step.units, row.step.rate_hz, *asdict(row.asked).values(), *asdict(row.streamed).values()) for row in rows
+        (row.step.units, row.step.rate_hz, *asdict(row.polled).values(), *asdict(row.streamed).values()) for row in rows
     ]
     remark = (
         f"ms from a frame's capture until a robot has the map decoded, {AGE_NS / NS_PER_MS:g} of them before it is "
-        f"sent; medians and p99. Asked: GET /voxels every {1e3 * ASK_S:g} ms. Streamed: each message of WS /stream."
+        f"sent; medians and p99. Asked: GET /voxels every {1e3 * POLL_S:g} ms. Streamed: each message of WS /stream."
     )
     marks = []
     for row in rows:
         if (row.step.units, row.step.rate_hz) == (FULL_UNITS, FULL_HZ):
             name = f"{FULL_UNITS} units at {FULL_HZ:g}/s: oldest frame at a robot"
-            marks.append(Mark(f"{name} that asks, p99 ms", row.asked.oldest_p99, at_most=AGE_MS_MAX))
+            marks.append(Mark(f"{name} that asks, p99 ms", row.polled.oldest_p99, at_most=AGE_MS_MAX))
             marks.append(Mark(f"{name} that listens, p99 ms", row.streamed.oldest_p99, at_most=AGE_MS_MAX))
     if any(row.step.units == MAX_UNITS for row in rows):
         full = [row for row in rows if row.step.units == MAX_UNITS]
@@ -289,7 +291,7 @@ def curves(rows: Sequence[Row]) -> list[Curves]:
         }
 
     trips = {"p50": lambda row: row.step.p50_ms, "p99": lambda row: row.step.p99_ms}
-    oldest = {"GET p99": lambda row: row.asked.oldest_p99, "stream p99": lambda row: row.streamed.oldest_p99}
+    oldest = {"GET p99": lambda row: row.polled.oldest_p99, "stream p99": lambda row: row.streamed.oldest_p99}
     cpu = {"master": lambda row: row.step.master_cpu_percent, "load": lambda row: row.step.load_cpu_percent}
     return [
         Curves("Round trip of an update", "units", "ms", over(trips), "xy"),

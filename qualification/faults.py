@@ -340,7 +340,7 @@ async def master_disk_full(site: Site, course: Course) -> None:
         full.unlink()
         await site.settled()
         # What was acknowledged must survive a crash, too.
-        await site.look_away()
+        await site.stop_observers()
         await site.kill(site.master)
         await site.start_master()
         course.lost = await site.lost()
@@ -374,7 +374,7 @@ async def units_swapped(site: Site, course: Course) -> None:
         await until(partial(registered, unit), "the swapped units register")
     await hold()
     course.gone_ns = monotonic_ns()
-    await tell_poses(site)
+    await set_and_expect_poses(site)
 
 
 async def address_taken(site: Site, course: Course) -> None:
@@ -382,12 +382,12 @@ async def address_taken(site: Site, course: Course) -> None:
     await swap_addresses(site, course)
     unit = await site.start_unit(FIRST)
     await until(partial(registered, unit), "the unit registers with the other's address")
-    await site.give_poses()
+    await site.set_poses()
     await hold()
     unit = await site.start_unit(SECOND)
     await until(partial(registered, unit), "the other unit registers")
     course.gone_ns = monotonic_ns()
-    await tell_poses(site)
+    await set_and_expect_poses(site)
 
 
 async def swap_addresses(site: Site, course: Course) -> None:
@@ -400,9 +400,9 @@ async def swap_addresses(site: Site, course: Course) -> None:
     site.addresses.reverse()
 
 
-async def tell_poses(site: Site) -> None:
+async def set_and_expect_poses(site: Site) -> None:
     """Set the poses of the cameras as an operator. The master must keep them from now on."""
-    await site.give_poses()
+    await site.set_poses()
     acknowledged = await site.acknowledged()
     for serial in SERIALS:
         site.expect(serial, acknowledged[serial])
@@ -476,7 +476,7 @@ async def strike(fault: Fault) -> dict[str, Any]:
                 trouble = str(error)
                 course.lost = course.lost or await site.lost()
             finally:
-                await site.look_away()
+                await site.stop_observers()
             return row(fault, site, course, trouble)
     finally:
         shutil.rmtree(folder, ignore_errors=True)

@@ -39,7 +39,7 @@ BOARDS = 2
 MASTER_S = 60.0
 """Time limit for the master to start on a busy computer."""
 
-LOOK_EVERY_S = 0.5
+CHECK_EVERY_S = 0.5
 """Time between two checks, which leaves the processor to the boards."""
 
 WAIT_S = 400.0
@@ -152,7 +152,7 @@ def boot(parts: Path, wait_s: float, document: dict[str, Any]) -> None:
         ]
         watch = Watch(boards, leases, operator)
         try:
-            until(watch.all_report, f"{BOARDS} boards that report voxels", wait_s, LOOK_EVERY_S)
+            until(watch.all_report, f"{BOARDS} boards that report voxels", wait_s, CHECK_EVERY_S)
         except MachineError:
             for board in boards:
                 print(f"---- the end of {board.name}'s console\n{board.tail()}", file=sys.stderr, flush=True)

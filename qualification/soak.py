@@ -129,7 +129,7 @@ class Soak:
                     )
             site.judge_all()
         finally:
-            await site.look_away()
+            await site.stop_observers()
             site.close()
         found.lifetimes = self._usage.lifetimes
         found.judged, found.wrongs, found.ended = site.judged, site.wrongs, site.ended

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two robots that read the map: one polls it, one subscribes to the stream. Both record the time of each map.
 
-`python -m benchmarks.load_generator.map_readers URL TOKEN_FILE ASK_S RESULT` reads until terminated, then writes RESULT
-(JSON): a list of `Reading` by reader. It runs on the master's machine and shares its clock. The file RESULT with the
-suffix BEGUN appears as soon as both readers have a map.
+`python -m benchmarks.load_generator.map_readers URL TOKEN_FILE POLL_S RESULT` reads until terminated, then writes
+RESULT (JSON): a list of `Reading` by reader. It runs on the master's machine and shares its clock. The file
+RESULT with the suffix BEGUN appears as soon as both readers have a map.
 """
 
 from __future__ import annotations
@@ -88,12 +88,12 @@ class Reader(threading.Thread):
         self.begun.set()
 
 
-class Asking(Reader):
-    """Polls every `ask_s`, or as soon as the answer has arrived if that takes longer."""
+class Poller(Reader):
+    """Polls every `poll_s`, or as soon as the answer has arrived if that takes longer."""
 
-    def __init__(self, url: str, token: str, ask_s: float) -> None:
+    def __init__(self, url: str, token: str, poll_s: float) -> None:
         super().__init__(url, token)
-        self.name, self._period_ns = ASKING, round(ask_s * NS_PER_S)
+        self.name, self._period_ns = ASKING, round(poll_s * NS_PER_S)
 
     def _read(self) -> None:
         host, _, port = self._netloc.partition(":")
@@ -111,7 +111,7 @@ class Asking(Reader):
                 self._take(asked_ns, body)
 
 
-class Listening(Reader):
+class Subscriber(Reader):
     """Receives each message of the stream."""
 
     def __init__(self, url: str, token: str) -> None:
@@ -136,14 +136,14 @@ def read(path: Path) -> dict[str, list[Reading]]:
 
 def main() -> None:
     """Read until terminated."""
-    url, token, ask_s, result = sys.argv[1], Path(sys.argv[2]).read_text().strip(), float(sys.argv[3]), sys.argv[4]
+    url, token, poll_s, result = sys.argv[1], Path(sys.argv[2]).read_text().strip(), float(sys.argv[3]), sys.argv[4]
     stopped = threading.Event()
 
     def stop(number: int, frame: FrameType | None) -> None:
         stopped.set()
 
     signal.signal(signal.SIGTERM, stop)
-    readers = (Asking(url, token, ask_s), Listening(url, token))
+    readers = (Poller(url, token, poll_s), Subscriber(url, token))
     for reader in readers:
         reader.start()
     for reader in readers:

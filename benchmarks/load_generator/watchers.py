@@ -18,7 +18,7 @@ from websockets.typing import Subprotocol
 
 WINDOW = "master_server.viewer.window"
 
-HEARD_MIN = 10
+MESSAGES_MIN = 10
 """Number of messages after which a viewer has the whole cell."""
 
 CAMERA: dict[str, Any] = {
@@ -36,7 +36,7 @@ CAMERA: dict[str, Any] = {
 """First message of a browser."""
 
 
-async def watch(url: str, token: str, sees: asyncio.Event) -> None:
+async def watch(url: str, token: str, ready: asyncio.Event) -> None:
     """Receive until cancelled."""
     subprotocol = Subprotocol(f"viser-v{version('viser')}")
     address = f"{url.replace('http', 'ws', 1)}/viewer/"
@@ -45,19 +45,19 @@ async def watch(url: str, token: str, sees: asyncio.Event) -> None:
         address, subprotocols=[subprotocol], additional_headers=headers, max_size=None, proxy=None
     ) as socket:
         await socket.send(msgpack.packb(CAMERA))
-        heard = 0
+        received = 0
         async for _ in socket:
-            heard += 1
-            if heard == HEARD_MIN:
-                sees.set()
+            received += 1
+            if received == MESSAGES_MIN:
+                ready.set()
 
 
 async def run(url: str, token_file: Path, master_pid: int, count: int, seeing: Path) -> None:
     """Run `count` viewers until terminated. Write the file `seeing` once all of them have the cell."""
     token = token_file.read_text().strip()
-    sights = [asyncio.Event() for _ in range(count)]
-    tasks = [asyncio.ensure_future(watch(url, token, sees)) for sees in sights]
-    everyone = asyncio.ensure_future(asyncio.gather(*(sees.wait() for sees in sights)))
+    each_ready = [asyncio.Event() for _ in range(count)]
+    tasks = [asyncio.ensure_future(watch(url, token, ready)) for ready in each_ready]
+    everyone = asyncio.ensure_future(asyncio.gather(*(ready.wait() for ready in each_ready)))
     waited: list[asyncio.Future[Any]] = [everyone, *tasks]
     await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
     if everyone.done():

@@ -131,7 +131,7 @@ class Bench:
         reader.read()
         rush.connect()
         for member in self._members:
-            await member.tell(None, monotonic_ns())
+            await member.report(None, monotonic_ns())
 
     async def _round(self, parts: Parts, n: int, reader: MapReader, rush: Rush) -> NDArray[np.uint32]:
         """Measure all parts once, at moment `n`. Return the map of all cameras."""
@@ -139,13 +139,13 @@ class Bench:
         sights, unit_ms, trip_ms = [], [], []
         for camera, (work, member) in enumerate(zip(self._work, self._members, strict=True)):
             began_ns = stage_ns()
-            sight = work.look(views.depth[camera, n], views.joints[n])
-            looked_ns = stage_ns()
-            await member.tell(sight, monotonic_ns())
-            told_ns = stage_ns()
+            sight = work.filter_frame(views.depth[camera, n], views.joints[n])
+            filtered_ns = stage_ns()
+            await member.report(sight, monotonic_ns())
+            reported_ns = stage_ns()
             sights.append(sight)
-            unit_ms.append((looked_ns - began_ns) / NS_PER_MS)
-            trip_ms.append((told_ns - looked_ns) / NS_PER_MS)
+            unit_ms.append((filtered_ns - began_ns) / NS_PER_MS)
+            trip_ms.append((reported_ns - filtered_ns) / NS_PER_MS)
         rush.run([None] * CAMERAS)
         rush_ms, merge_ms, map_ms, merged = [], [], [], self._merged
         for count in range(1, CAMERAS + 1):

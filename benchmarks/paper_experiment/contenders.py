@@ -42,7 +42,7 @@ class UnitWork:
         """Change the voxel size."""
         self.pipeline.apply(FilterSettings(voxel_size_m=voxel_size_m))
 
-    def look(self, depth: NDArray[np.uint16], joints: NDArray[np.float64]) -> Sight:
+    def filter_frame(self, depth: NDArray[np.uint16], joints: NDArray[np.float64]) -> Sight:
         """Filter a frame and report seen and health. The seen report is made anew each time."""
         result = self.pipeline.process(depth, joints)
         voxels, health = result.voxels, result.health

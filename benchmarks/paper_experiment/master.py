@@ -84,7 +84,7 @@ class Member:
             **({} if sight is None else {"keys": sight.keys, "seen": sight.seen, "health": sight.health}),
         )
 
-    async def tell(self, sight: Sight | None, captured_at_ns: int) -> None:
+    async def report(self, sight: Sight | None, captured_at_ns: int) -> None:
         """Post an update by the unit's client, encoding included."""
         update = self.update(sight, captured_at_ns)
         answer = await self.client.update(update)

@@ -17,7 +17,7 @@ from benchmarks.paper_experiment.book import ONE_PROCESS_BESIDE, UNITS_RUNNING, 
 from benchmarks.paper_experiment.contenders import Centralised, UnitWork, prepared
 from benchmarks.paper_experiment.master import MapReader, Site, keys_of
 from benchmarks.paper_experiment.scene import CAMERAS, Views
-from benchmarks.paper_experiment.unit import Look, Order, Resize, Watch, run
+from benchmarks.paper_experiment.unit import Command, FilterFrame, Resize, UseCamera, run
 from shared.clock import NS_PER_MS, stage_ns
 from shared.errors import UplinkError
 
@@ -34,15 +34,15 @@ class Units:
 
     pipes: list[Connection]
 
-    def tell_all(self, orders: Sequence[Order]) -> None:
+    def send_all(self, commands: Sequence[Command]) -> None:
         """Send one command to each of the first units, and wait until all are done.
 
         Raises:
             UplinkError: a unit ended, or did not finish in time.
         """
-        chosen = self.pipes[: len(orders)]
-        for pipe, order in zip(chosen, orders, strict=True):
-            pipe.send(order)
+        chosen = self.pipes[: len(commands)]
+        for pipe, command in zip(chosen, commands, strict=True):
+            pipe.send(command)
         for number, pipe in enumerate(chosen):
             if not pipe.poll(ANSWER_S):
                 raise UplinkError(
@@ -89,12 +89,12 @@ class Bench:
         self._site, self._units, self._views, self._book = site, units, views, book
         self._work = prepared(views, 0.05)
         self._centralised = Centralised(self._work)
-        orders: list[Order] = []
+        commands: list[Command] = []
         for camera, pose in enumerate(views.poses):
             path = folder / f"{views.name}-{camera}.npy"
             np.save(path, views.depth[camera])
-            orders.append(Watch(views.intrinsics, pose, path, views.joints))
-        units.tell_all(orders)
+            commands.append(UseCamera(views.intrinsics, pose, path, views.joints))
+        units.send_all(commands)
 
     async def run(self, sizes_m: Sequence[float], rounds: int) -> None:
         """Run `rounds` rounds for each voxel size, in turns with all cameras in one process."""
@@ -102,7 +102,7 @@ class Bench:
             await self._site.change_voxel_size(size_m)
             for work in self._work:
                 work.resize(size_m)
-            self._units.tell_all([Resize(size_m)] * CAMERAS)
+            self._units.send_all([Resize(size_m)] * CAMERAS)
             expected = [
                 [_keys(work, self._views, i, n) for n in range(self._views.frames)] for i, work in enumerate(self._work)
             ]
@@ -117,9 +117,9 @@ class Bench:
 
     def _refresh(self, count: int, n: int, reader: MapReader, expected: list[list[NDArray[np.uint32]]]) -> float:
         """Return the milliseconds until the map holds exactly what the first `count` units see at moment `n`."""
-        self._units.tell_all([Look(None)] * CAMERAS)
+        self._units.send_all([FilterFrame(None)] * CAMERAS)
         began_ns = stage_ns()
-        self._units.tell_all([Look(n)] * count)
+        self._units.send_all([FilterFrame(n)] * count)
         body = reader.read()
         spent_ms = (stage_ns() - began_ns) / NS_PER_MS
         right = np.unique(np.concatenate([keys[n] for keys in expected[:count]]))
@@ -129,4 +129,4 @@ class Bench:
 
 
 def _keys(work: UnitWork, views: Views, camera: int, n: int) -> NDArray[np.uint32]:
-    return work.look(views.depth[camera, n], views.joints[n]).voxels
+    return work.filter_frame(views.depth[camera, n], views.joints[n]).voxels

@@ -87,7 +87,7 @@ def _mark_row(mark: dict[str, Any]) -> str:
 
 
 def _section(part: Part, document: dict[str, Any], folder: Path) -> list[str]:
-    lines = [f"## {part.title}", "", part.asks, "", *_taken(part, document.get("taken")), ""]
+    lines = [f"## {part.title}", "", part.question, "", *_taken(part, document.get("taken")), ""]
     for node in _nodes(document):
         if "title" in node and "rows" in node:
             lines += _table(node)

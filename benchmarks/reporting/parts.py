@@ -17,7 +17,7 @@ class Part:
     """Target of `make` that runs the part alone."""
 
     title: str
-    asks: str
+    question: str
     limit_s: float | None = None
     """Time limit of the part in `make bench`. None: the part runs only by itself."""
 

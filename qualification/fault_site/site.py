@@ -38,7 +38,7 @@ START_S = 240.0
 RETURN_S = 15.0
 """Time limit for a complete map to return. A longer time has missed its mark anyway."""
 
-LOOK_S = 0.005
+CHECK_S = 0.005
 """Time between two checks of a log, or of the map's answers."""
 
 SETTING = {"margin_base_m": 0.031}
@@ -141,7 +141,7 @@ class Site:
             FaultError: the map does not become complete.
         """
         await until(lambda: all(registered(unit) for unit in self.units), "two registered units")
-        await self.give_poses()
+        await self.set_poses()
         response = await self.operator.put("/settings", json=SETTING)
         response.raise_for_status()
         since_ns = monotonic_ns()
@@ -157,13 +157,13 @@ class Site:
         self._before = await self.acknowledged()
         await asyncio.sleep(SETTLED_S)
 
-    async def look_away(self) -> None:
+    async def stop_observers(self) -> None:
         """Stop all observers. It may be called again."""
         for observer in self.watching:
             await asyncio.to_thread(observer.stop)
         self.watching = []
 
-    async def give_poses(self) -> None:
+    async def set_poses(self) -> None:
         """Set the pose of each camera, as an operator would."""
         for row in (await self.operator.get("/units")).json():
             pose = T_WORLD_CAMERA[SERIALS.index(row["serial"])]
@@ -252,4 +252,4 @@ async def until(
             return found
         if monotonic_ns() > deadline_ns:
             raise FaultError(f"{what}: not within {timeout_s:g} s; {last()}")
-        await asyncio.sleep(LOOK_S)
+        await asyncio.sleep(CHECK_S)

@@ -16,7 +16,7 @@ from edge_unit.uplink.assignment import Report
 
 HANG = Path("/run/hang")
 
-LOOK_S = 0.1
+CHECK_S = 0.1
 
 process = FrameWork.process
 
@@ -25,7 +25,7 @@ def hanging(self: FrameWork, *arguments: object) -> Report:
     """Run `FrameWork.process` some time after `HANG` is gone."""
     never = threading.Event()
     while HANG.exists():
-        never.wait(LOOK_S)
+        never.wait(CHECK_S)
     return process(self, *arguments)  # type: ignore[arg-type]  # handed on as they come
 
 

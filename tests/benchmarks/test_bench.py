@@ -22,7 +22,7 @@ sys.exit(1)
 
 
 def part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, limit_s: float = 60.0) -> Part:
-    """A part whose module is `source`."""
+    """Return a part whose module is `source`."""
     folder = tmp_path / "modules"
     folder.mkdir()
     (folder / "made.py").write_text(source)
@@ -30,13 +30,11 @@ def part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, limit_s: 
     return Part("made", "made", "Made", "Is it?", limit_s=limit_s, arguments=(str(tmp_path),))
 
 
-def test_a_part_that_left_its_result_has_measured_whatever_its_exit_code(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_part_with_a_result_has_measured_at_any_exit_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(part(tmp_path, monkeypatch, WRITES), tmp_path)["trouble"] == ""
 
 
-def test_a_result_of_before_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_old_result_does_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "made.json").write_text("{}")
     made = part(tmp_path, monkeypatch, "raise ImportError('no such peer')")
     assert run(made, tmp_path)["trouble"] == "no result, exit code 1"
@@ -55,7 +53,7 @@ def test_each_part_is_a_module_and_a_target_of_make(each: Part) -> None:
     assert re.search(rf"^{each.target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
 
 
-def test_only_what_was_measured_becomes_the_baseline(tmp_path: Path) -> None:
+def test_only_measured_parts_replace_the_baseline(tmp_path: Path) -> None:
     results, baseline = tmp_path / "results", tmp_path / "baseline"
     results.mkdir()
     baseline.mkdir()

@@ -71,10 +71,11 @@ SHOWN = {
 """The columns of each axis's table."""
 
 REMARKS = (
-    "All contenders get the same frames, the same picture of what is known (the pipeline's expected depth) and the "
-    "same mask of the padded robot: rules are compared, not renderers.",
-    "The noise model is a D435i's as measured on recorded frames, with halo, shadow, flying pixels and holes; it never "
-    "loses a thin thing as a real stereo matcher may, and has no wrong matches but those of the curves that name them.",
+    "All contenders get the same frames, the same expected depth of the pipeline and the same mask "
+    "of the padded robot: the benchmark compares rules, not renderers.",
+    "The noise model is a D435i's as measured on recorded frames, with halo, shadow, flying pixels "
+    "and holes. It never loses a thin thing, as a real stereo matcher may. Only the curves that name"
+    " them have wrong matches.",
 )
 
 PICTURES = (

@@ -271,8 +271,8 @@ def result(found: Sequence[Timed]) -> Result:
         f"Frames that were merged: {told}.",
         f"Medians and p99 do not add up. Cameras play {FRAMES} frames of the demo cell (a person, the robot in its "
         f"period of {PERIOD_S:g} s) rendered beforehand; a frame counts from the moment at which it fell due.",
-        "The stages up to the merge are what the units' own trace tells (trace_path), the master's times among them by "
-        "their estimate of its clock; what a robot has, by its own.",
+        "The stages up to the merge come from the units' own trace (trace_path), with the master's times"
+        " converted by the unit's estimate of its clock. Later stages come from the robot's clock.",
     )
     return Result(f"Where the milliseconds go: {UNITS} units, one master", columns, tuple(rows), tuple(marks), remarks)
 

@@ -200,9 +200,10 @@ def load_result(rows: Sequence[Row], refused: str) -> Result:
         ))  # fmt: skip
     remarks = [
         "p50, p99: round trip of an update, from when it fell due. in master: from its last byte to its answer.",
-        "bytes: update and answer with all headers and the seen report. CPU: of the master's process, with readers and "
-        "robot. waited: for the core, which others had: what is not the master's fault. load CPU: of what plays the "
-        "units; near 100 it is this that is late, not the master.",
+        "bytes: update and answer with all headers and the seen report. CPU: of the master's process, "
+        "with readers and robot. waited: time for which the master was ready but had no core, because of"
+        " other processes. load CPU: of the process that plays the units; near 100 this process is late,"
+        " not the master.",
     ]
     if refused:
         remarks.append(f"It stops at {MAX_UNITS} units because it is told to: {refused}")
@@ -263,8 +264,9 @@ def cost_result(costs: Sequence[MergeCost]) -> Result:
     """Return the cost of the merge itself."""
     columns = ("units", "voxels of the map", "merge us", "union us", "answer us")
     remark = (
-        "merge: one report in place of the one before. union: the keys of all, after a change; answer: indices and "
-        "witnesses as msgpack. Both once a picture of the stream (at most 100 a second) or a GET, not once an update."
+        "merge: one report replaces the one before. union: the keys of all after a change; answer: "
+        "indices and witnesses as msgpack. Both are made once per message of the stream (at most 100 a "
+        "second) or per GET, not per update."
     )
     rows = tuple(tuple(asdict(cost).values()) for cost in costs)
     return Result("The merge itself, in one process", columns, rows, remarks=(remark,))

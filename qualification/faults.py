@@ -435,13 +435,13 @@ ONE = f"({ADDRESSES[FIRST]})"
 
 FAULTS: tuple[Fault, ...] = (
     Fault("unit-killed", "a unit is killed and started again", ONE, unit_killed),
-    Fault("unit-frozen", "a unit stands still (SIGSTOP, SIGCONT)", ONE, unit_frozen),
+    Fault("unit-frozen", "a unit is stopped (SIGSTOP, SIGCONT)", ONE, unit_frozen),
     Fault("wall-clock-ahead", "a unit's wall clock jumps 1 h ahead", None, wall_clock(FIRST, HOUR_S), False),
     Fault("wall-clock-back", "a unit's wall clock jumps 1 h back", None, wall_clock(FIRST, -HOUR_S), False),
     Fault("master-wall-clock", "the master's wall clock jumps 1 h back", None, wall_clock(None, -HOUR_S), False),
     Fault("monotonic-elsewhere", "a unit's monotonic clock starts 11 days ahead", ONE, monotonic_clock(10**6)),
     Fault("network-cut", "a unit's network cable is pulled, and plugged in", f"({UNIT_IP})", network_cut),
-    Fault("network-slow", "what a unit sends is 200 ms (+-50) under way", None, network_slow, False),
+    Fault("network-slow", "a unit's data is delayed by 200 ms (+-50)", None, network_slow, False),
     Fault("connections-cut", "a unit's connections are reset, 3 times a second", None, connections_cut, False),
     Fault("master-killed", "the master is killed and started again", "", master_killed),
     Fault("camera-died-meanwhile", "... and a unit dies while it is down", ONE, camera_died_meanwhile),
@@ -572,12 +572,12 @@ def result_of(rows: Sequence[dict[str, Any]]) -> Result:
     starts = (f"From the start of a unit's process until it registered, s: {started}.",) if started else ()
     marks = (
         Mark("faults after which a mark was missed", float(sum(not each["met"] for each in rows)), at_most=0.0),
-        Mark("longest until it was noticed, s", _longest(rows, "noticed_s"), at_most=NOTICED_S_MAX),
-        Mark("longest until the map was right again, s", _longest(rows, "recovered_s"), at_most=RECOVERED_S_MAX),
+        Mark("longest time until noticed, s", _longest(rows, "noticed_s"), at_most=NOTICED_S_MAX),
+        Mark("longest time until the map was right again, s", _longest(rows, "recovered_s"), at_most=RECOVERED_S_MAX),
         Mark(
-            "faults that made a map say free of what nobody sees", float(sum(each["false_free"] for each in rows)), 0.0
+            "faults after which a map called an unseen place free", float(sum(each["false_free"] for each in rows)), 0.0
         ),
-        Mark("acknowledged things lost", float(sum(each["lost"] for each in rows)), at_most=0.0),
+        Mark("acknowledged values lost", float(sum(each["lost"] for each in rows)), at_most=0.0),
     )
     return Result("Faults, with real processes", columns, cells, marks, (*REMARKS, *starts))
 

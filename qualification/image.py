@@ -219,8 +219,8 @@ def result_of(document: dict[str, Any]) -> Result:
     figures = (
         ("from power-on to the first voxel, s", document.get("seconds_power_on_to_first_voxel")),
         ("image, MB", document.get("image_mb")),
-        ("of that the release, MB", document.get("payload_mb")),
-        ("all of it, with what had to be built, s", document.get("seconds")),
+        ("release in the image, MB", document.get("payload_mb")),
+        ("total with the build, s", document.get("seconds")),
     )
     return Result(
         f"{BOARDS} arm64 boards of one image, every instruction emulated",

@@ -237,18 +237,18 @@ def results(found: Found) -> dict[str, Result]:
     for strike in found.strikes:
         held_s[strike.name] += strike.hold_s
     faults = Result(
-        "What happened",
+        "Events",
         ("fault", "times", "s in all"),
         tuple((name, counts[name], round(float(held_s[name]), 1)) for name in KINDS if counts[name]),
     )
     wrongs = tuple(found.wrongs[:SHOWN])
     lost = [calm for calm in found.calms if calm.trouble]
     calms = Result(
-        "When it was over",
+        "State after each round",
         ("round", "at s", "right again after s", "what was not"),
         tuple((n, calm.at_s, calm.recovered_s, calm.trouble or "-") for n, calm in enumerate(found.calms, 1)),
         (
-            Mark("answers that were wrong", float(len(found.wrongs)), at_most=0.0, why="; ".join(wrongs) or None),
+            Mark("wrong answers", float(len(found.wrongs)), at_most=0.0, why="; ".join(wrongs) or None),
             Mark(
                 f"rounds after which the map was not what it was within {CALM_S:g} s",
                 float(len(lost)),
@@ -293,7 +293,7 @@ def _process_result(judged: Sequence[Lifetime], count: int) -> Result:
         f"more: threads and handles at the last calm moment beyond the most of any in the first half of these; {SPARE} "
         "are spare, for pools that were never full at once and connections that a unit keeps or not.",
     )
-    return Result("What the processes held", columns, tuple(rows), marks, remarks)
+    return Result("Resources of the processes", columns, tuple(rows), marks, remarks)
 
 
 async def soak(folder: Path, seed: int, seconds: float) -> Found:

@@ -104,14 +104,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     marks = [
         Mark("tests that failed", float(found["failed"]), at_most=0.0),
         Mark(
-            "update p99 with one who looks, times that with nobody",
+            "update p99 with one viewer, relative to none",
             found["update_p99_ratio_1_viewer"],
             at_most=RATIO_OF_ONE,
-            why=f"with nobody it is {found['update_p99_ms']:.2f} ms; master and window share one core, those who look "
-            "and the load the other: an update that comes while the window asks, ten times a second, waits for it",
+            why=f"without a viewer it is {found['update_p99_ms']:.2f} ms; master and window share one core, viewers "
+            "and load the other: an update that comes during a request of the window, ten times a second, waits for it",
         ),
         Mark(
-            "update p99 with ten who look, times that with nobody",
+            "update p99 with ten viewers, relative to none",
             found["update_p99_ratio_10_viewers"],
             at_most=RATIO_OF_TEN,
         ),

@@ -151,15 +151,15 @@ RECALLS = ("recall_percent", "recall_strict_percent", "lost_percent", "false_per
 ERRORS = ("tool_median_mm", "tool_p99_mm", "tool_p1_mm", "camera_median_mm", "camera_p99_mm", "camera_p1_mm")
 
 REASONS = (
-    "The halo of stereo makes things some 30 mm larger, and a voxel is counted as a cube: ours keeps the voxels at the "
-    "rim of a thing, and so shows it nearer than it is, by more than a rule that deletes them. Of a rule that loses "
-    "the thing in some frames, 99 % have no figure.",
-    "Close to what is known ours sees nothing within a margin that grows with noise; a fixed limit that is smaller "
-    "sees more there, and reports the noise of all that is farther away.",
-    "With the noise of a real camera at 3.5 m, which lies above the square law that ours reckons with, a wall in CAD "
-    "is not quite quiet.",
-    "Where the halo of a near thing covers a farther one the pixels show the near one: no rule finds what is not "
-    "measured, but one that takes five points may still find a few between.",
+    "The halo of stereo makes things some 30 mm larger, and a voxel counts as a cube. Ours keeps the"
+    " voxels at the rim of a thing, so it shows the thing nearer than it is, and nearer than a rule "
+    "that deletes these voxels. A rule that loses the thing in some frames has no figure for 99 %.",
+    "Close to a known surface ours sees nothing within a margin that grows with noise. A smaller "
+    "fixed limit sees more there, but reports the noise of everything farther away.",
+    "The noise of a real camera at 3.5 m lies above the square law of our margin, so a wall in CAD "
+    "gives a few false voxels.",
+    "The halo of a near thing can cover a farther one. Its pixels then show the near thing: no rule "
+    "finds unmeasured surfaces, but a rule of five points may still find a few points between.",
 )
 
 COMPARED = (
@@ -185,15 +185,17 @@ AXES = {
         ),
         Axis("points", "least points in a voxel", "points", RECALLS, "thing at 1.5 m, 50 mm voxels"),
         Axis(
-            "stand-off", "how far the front stands before the wall", "mm", RECALLS,
-            "an arm parallel to the wall, 50 mm voxels: what is closer to what is known than a margin is not seen",
+            "stand-off", "distance of the front from the wall", "mm", RECALLS,
+            "an arm parallel to the wall, 50 mm voxels: things closer to a known surface than the margin are"
+            " not seen",
         ),
         Axis(
-            "limit", "fixed offset before what is known", "mm", RECALLS,
-            "thing at 2.5 m, wall 1 m behind; ours reckons its own margin and is drawn over all of it",
+            "limit", "fixed offset before the known surface", "mm", RECALLS,
+            "thing at 2.5 m, wall 1 m behind; ours computes its own margin, and its line is drawn over all "
+            "of the axis",
         ),
         Axis("wall", "distance of the wall", "m", ("false_per_1000",), "a wall in CAD, square to the camera, alone"),
-        Axis("quiet", "camera of the demo cell", "number", ("false_per_1000",), "nothing but the robot moves"),
+        Axis("quiet", "camera of the demo cell", "number", ("false_per_1000",), "only the robot moves"),
     )
 }  # fmt: skip
 
@@ -289,7 +291,7 @@ def worse(curves: Iterable[Curve], ours: str, others: tuple[str, ...]) -> Result
                 figure = f"{curve.metric.label}, {curve.metric.unit}"
                 rows.append((other, figure, curve.subject, where, x, mine, theirs))
     columns = ("than", "in", "before", "at", "worst at", "ours", "theirs")
-    return Result("Where ours is the worse", columns, tuple(rows), remarks=REASONS)
+    return Result("Figures in which ours is worse", columns, tuple(rows), remarks=REASONS)
 
 
 def _is_worse(metric: Metric, mine: float, theirs: float) -> bool:

@@ -90,8 +90,9 @@ def results(judged: list[Judged], ours: str) -> list[Result]:
         second = (found.second_robot_miss_percent, found.second_robot_voxels) if each.is_watched else (math.nan,) * 2
         rows.append((each.contender, each.frame, found.robot_leak_percent, *second, _false(each)))
     note = (
-        "Frames 0 to 3 show a second robot and are judged by what the empty ones taught, 4 to 9 are empty and judged "
-        "each by what the other five taught; all contenders share the learned background and the robot's mask.",
+        "Frames 0 to 3 show a second robot and use a background model of the empty frames. Frames 4 to 9"
+        " are empty, and each uses a background model of the other five. All contenders share the "
+        "background model and the robot mask.",
     )
     return [
         Result("Real frames, one by one", columns, tuple(rows), remarks=(*note, *remarks(judged, ours))),

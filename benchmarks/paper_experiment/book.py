@@ -17,18 +17,20 @@ ONE_OCTREE = "centralised, as MoveIt's updaters"
 UNITS_SAME_FRAMES = "distributed, composed, all cameras with the same frames"
 
 CONTENDERS = {
-    UNITS_COMPOSED: "Each unit's work (process()) on a core of its own, then its update by the "
-    "units' own client over HTTP on loopback to a real master; the slowest counts. To it are added what the updates "
-    "of all units at the same moment take longer than one, and the master's merge.",
-    UNITS_RUNNING: "One process for each unit and one for the master, which share the cores of this machine: from "
-    "handing all units their frames at once until GET /voxels has brought a map that holds all of them.",
+    UNITS_COMPOSED: "Each unit's work (process()) on a core of its own, then its update by the units' own client "
+    "over HTTP on loopback to a real master; the slowest unit counts. Two times are added: the "
+    "additional time of all updates at the same moment compared with one, and the master's merge.",
+    UNITS_RUNNING: "One process for each unit and one for the master, which share the cores of this machine. The "
+    "time runs from handing all units their frames at once until GET /voxels returns a map that "
+    "holds all of them.",
     ONE_PROCESS: "The pipelines of all cameras in turn in one process on one core, and the master's own merge "
-    "there. In its favour: it finds the depth images in its memory, however they come there.",
+    "there. In its favour: the depth images are already in its memory.",
     ONE_PROCESS_BESIDE: "The same, measured in turns with the processes, not pinned to a core.",
     ONE_OCTREE: "All cameras in turn on one core: CAD and robot masked out of the depth image, points, "
-    "OctoMap.insertPointCloud with free-space rays (discretized) into one octree. In its favour: no rays to what is "
-    "CAD or robot, though MoveIt casts them, and nobody else locks the octree.",
-    UNITS_SAME_FRAMES: "As composed, but all cameras see what the first one sees, so that only their number changes.",
+    "OctoMap.insertPointCloud with free-space rays (discretized) into one octree. In its favour: no "
+    "rays to CAD and robot, which MoveIt casts, and no other user of the octree's lock.",
+    UNITS_SAME_FRAMES: "As composed, but all cameras have the frames of the first one, so that only their number "
+    "changes.",
 }
 
 

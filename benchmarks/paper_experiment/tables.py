@@ -58,14 +58,15 @@ NOT_COMPARABLE = (
     "The paper's distributed units were Jetson Nanos (four Cortex-A57 at 1.43 GHz), its centralised system a laptop "
     "with a GTX 1070, with real cameras at 15 frames a second: its milliseconds and ours are not comparable, the "
     "ratios between contenders on one machine are.",
-    "The cells of its Tables 1 and 2 are not in its text; only what the text states stands beside ours.",
-    "Frames are simulated (rays by Embree, a D435i's faults), one person, a UR3 that moves in every frame; the joints "
-    "lie beside the frames, and nobody reports joints to the master meanwhile.",
+    "The text of the paper does not contain the cells of its Tables 1 and 2; only the figures in the"
+    " text are compared with ours.",
+    "Frames are simulated (rays by Embree, a D435i's faults), one person, a UR3 that moves in every "
+    "frame. The joints are stored with the frames, and no joints are sent to the master meanwhile.",
 )
 
 BELOW_ZERO = (
-    "Below zero the centralised way is the faster one: where a frame costs less than bringing its voxels to a master. "
-    "What is compared are equal cores; the paper's centralised computer was the stronger one."
+    "Below zero the centralised way is faster: a frame costs less than bringing its voxels to a "
+    "master. The comparison uses equal cores; the paper's centralised computer was the stronger one."
 )
 
 Row = tuple[str | float, ...]
@@ -223,8 +224,8 @@ def running(book: Book) -> Result:
         rows.append((key.resolution, key.voxel_mm, key.cameras, ours.median_ms, ours.p99_ms, theirs))
     columns = ("resolution", "voxel mm", "cameras", "processes ms", "p99", "one process ms")
     remark = (
-        "Here the units share this machine's cores and pay for processes and HTTP besides: what is gained by units is "
-        "that each brings a computer of its own."
+        "Here the units share this machine's cores and also pay for processes and HTTP. The gain of "
+        "units is that each brings a computer of its own."
     )
     return Result(f"Refresh of the scene: {UNITS_RUNNING}", columns, tuple(rows), remarks=(remark,))
 

@@ -241,7 +241,7 @@ async def network_slow(site: Site, course: Course) -> None:
         proxy.delay_s, proxy.jitter_s = 0.2, 0.05
         site.newcomer()
         await hold(2.0 * HOLD_S)
-        ages = [a.age_s for a in site.asker.answers if a.age_s is not None and a.got_ns > course.cause_ns]
+        ages = [a.age_s for a in site.poller.answers if a.age_s is not None and a.got_ns > course.cause_ns]
         course.figures["oldest_view_s_max"] = max(ages)
         course.gone_ns = monotonic_ns()
         proxy.delay_s = proxy.jitter_s = 0.0
@@ -495,7 +495,7 @@ def row(fault: Fault, site: Site, course: Course, trouble: str) -> dict[str, Any
             fault.blind,
             len(SERIALS),
         )
-        for answers in (site.asker.answers, in_force(site.listener.answers))
+        for answers in (site.poller.answers, in_force(site.subscriber.answers))
     )
     false = polled.false_free or (streamed.false_free and f"stream: {streamed.false_free}")
     return {
@@ -509,8 +509,8 @@ def row(fault: Fault, site: Site, course: Course, trouble: str) -> dict[str, Any
         "stream_noticed_s": _rounded(streamed.noticed_s),
         "stream_recovered_s": _rounded(streamed.recovered_s),
         "complete_share": round(polled.complete_share, 3),
-        "answers": len(site.asker.answers),
-        "messages": len(site.listener.answers),
+        "answers": len(site.poller.answers),
+        "messages": len(site.subscriber.answers),
         **{name: _rounded(value) if isinstance(value, float) else value for name, value in course.figures.items()},
         **({"first_false": false} if false else {}),
         **({"forgotten": course.lost} if course.lost else {}),

@@ -194,7 +194,7 @@ class Soak:
 
     async def _trouble(self) -> str:
         """Return the difference to the map before all faults, in words."""
-        answer = self._site.asker.answers[-1]
+        answer = self._site.poller.answers[-1]
         if answer.now_ns is None:
             return "the master does not answer"
         if not answer.complete:

@@ -22,7 +22,7 @@ from qualification.fault_site.scene import (
     write_camera,
     write_cell,
 )
-from qualification.fault_site.watch import SETTLED_S, Asker, Listener, Observer, Present, good
+from qualification.fault_site.watch import SETTLED_S, Observer, Poller, Present, Subscriber, good
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, MasterUnreachable
 from simulation.fleet.processes import Child, Processes
@@ -64,8 +64,8 @@ class Site:
     master: Child = field(init=False)
     robot: Child = field(init=False)
     operator: httpx.AsyncClient = field(init=False)
-    asker: Asker = field(init=False)
-    listener: Listener = field(init=False)
+    poller: Poller = field(init=False)
+    subscriber: Subscriber = field(init=False)
     watching: list[Observer] = field(init=False, default_factory=list)
     cameras: list[Path] = field(init=False)
     _starts: int = field(init=False, default=0)
@@ -147,8 +147,8 @@ class Site:
         since_ns = monotonic_ns()
         self.present = [Present(thing, since_ns) for thing in RESIDENTS]
         things = (*RESIDENTS, NEWCOMER)
-        self.asker, self.listener = Asker(self.port, things), Listener(self.port, things)
-        self.watching = [self.asker, self.listener]
+        self.poller, self.subscriber = Poller(self.port, things), Subscriber(self.port, things)
+        self.watching = [self.poller, self.subscriber]
         for observer in self.watching:
             observer.start()
         await self.settled(START_S)
@@ -195,7 +195,7 @@ class Site:
         began_ns = monotonic_ns()
 
         def look() -> bool:
-            answers = self.asker.answers
+            answers = self.poller.answers
             end_ns = monotonic_ns()
             if end_ns - began_ns < SETTLED_S * NS_PER_S:
                 return False
@@ -203,7 +203,7 @@ class Site:
             return bool(recent) and all(good(answer, names, len(SERIALS)) for answer in recent)
 
         await until(
-            look, "a complete map that tells of all that is there", timeout_s, lambda: f"{self.asker.answers[-1:]}"
+            look, "a complete map that tells of all that is there", timeout_s, lambda: f"{self.poller.answers[-1:]}"
         )
 
     async def acknowledged(self) -> dict[str, Any]:

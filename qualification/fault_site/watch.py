@@ -107,7 +107,7 @@ class Observer(threading.Thread):
         )
 
 
-class Asker(Observer):
+class Poller(Observer):
     """Polls GET /voxels every POLL_S."""
 
     def run(self) -> None:
@@ -124,7 +124,7 @@ class Asker(Observer):
         connection.close()
 
 
-class Listener(Observer):
+class Subscriber(Observer):
     """Subscribes to WS /stream. A message counts from its arrival; silence for SILENT_S counts as no answer."""
 
     def run(self) -> None:

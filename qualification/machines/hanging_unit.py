@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The unit of a machine, but for a frame that never comes to its end while a certain file is there.
+"""The unit of a machine, except that its filter never returns while a certain file exists.
 
-It is copied onto the machine as it is, so it imports nothing but what a board has.
+It is copied onto the machine as it is, so it imports only what a board has.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from edge_unit.uplink.assignment import Report
 
 HANG = Path("/run/hang")
 
-LOOK_S = 0.1
+CHECK_S = 0.1
 
 process = FrameWork.process
 
 
 def hanging(self: FrameWork, *arguments: object) -> Report:
-    """As `FrameWork.process`, some time after `HANG` is gone."""
+    """Run `FrameWork.process` some time after `HANG` is gone."""
     never = threading.Event()
     while HANG.exists():
-        never.wait(LOOK_S)
+        never.wait(CHECK_S)
     return process(self, *arguments)  # type: ignore[arg-type]  # handed on as they come
 
 

@@ -30,7 +30,8 @@ from tests.system.cluster import Cluster
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 PAGES = (CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").rglob("*.md")))
-LIMIT_S = 60.0
+LIMIT_S = 200.0
+"""Kernels may have to be compiled first."""
 MOMENT_S = 2.0
 """A block that loops for ever is stopped after this time."""
 
@@ -86,7 +87,13 @@ def blocks(page: str) -> Iterator[Block]:
 
 
 ALL = [(page.relative_to(CHECKOUT).as_posix(), block) for page in PAGES for block in blocks(page.read_text("utf-8"))]
-RUN_PAGES = sorted({page for page, block in ALL if block.reason is None and block.language in {"sh", "python"}})
+RUN = [(page, block) for page, block in ALL if block.reason is None and block.language in {"sh", "python"}]
+COMPILE = {page for page, block in RUN if "edge_unit.pipeline" in block.code}
+"""Pages of which a block may have to compile kernels first."""
+RUN_PAGES = [
+    pytest.param(page, marks=[pytest.mark.slow] if page in COMPILE else [], id=page)
+    for page in sorted({page for page, _ in RUN})
+]
 YAML = [(page, block) for page, block in ALL if block.reason is None and block.language == "yaml"]
 
 
@@ -146,12 +153,10 @@ def command_of(block: Block, port: int) -> list[str]:
     return ["bash", "-euo", "pipefail", "-c", f"{OPERATOR}\n{code}"]
 
 
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(500)
 @pytest.mark.parametrize("page", RUN_PAGES)
 def test_the_blocks_of_a_page_run(page: str, folder: Path, master: Cluster) -> None:
-    for block in [block for name, block in ALL if name == page and block.reason is None]:
-        if block.language not in {"sh", "python"}:
-            continue
+    for block in [block for name, block in RUN if name == page]:
         command_line = command_of(block, master.port)
         endless = re.search(r"^\s*while True:", block.code, re.MULTILINE) is not None
         environment = {

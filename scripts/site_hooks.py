@@ -31,12 +31,17 @@ NO_LIBRARY = {"benchmarks", "qualification", "tests"}
 REFERENCE, REPOSITORY = "reference", "repository"
 FIRST = (
     "index.md",
+    "getting-started.md",
     "architecture.md",
     "glossary.md",
     "cell.md",
     "unit.md",
     "calibration.md",
     "watching.md",
+    "rest.md",
+    "viewer.md",
+    "recording.md",
+    "library.md",
     "deploy.md",
 )
 """Pages in the order in which they are read; all others follow by name."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every block of code in README.md and docs/ runs, or the page or this file says why not.
+"""Every block of code in README.md and docs/ runs, or the page says why not.
 
 The blocks of one page run in their order in one folder, with a running master's `state`, a `cell.yaml` and `.venv`,
 as a reader of the page has them. A block that does not run has a comment before it: `<!-- not run: needs a camera -->`.
@@ -43,26 +43,9 @@ REASON = re.compile(r"<!-- not run: (\S.*?) -->\s*\Z")
 OUTPUT = {"", "text"}
 """Blocks in no language show what is printed, or a drawing."""
 
-SHELL_NOT_RUN = {
-    r"\b(?:sudo|ufw)\b": "needs root",
-    r"\bssh\b": "needs another machine",
-    r"\b(?:systemctl|journalctl)\b": "needs systemd",
-    r"deploy/image/wheelhouse": "downloads wheels",
-    r"\b192\.168\.": "needs a master at that address",
-    r"^make (?:demo|test)\b": "takes minutes, or runs until it is stopped; tests/system/test_demo.py runs the demo",
-    r"master-server --cell": "runs until it is stopped",
-    r"master-server (?:replay|recording-info)": "needs a recording",
-    r"edge-unit (?:run|doctor)": "needs a camera",
-    r"/units/(?:1|ID)/": "needs a live unit with the id 1",
-    r"\(cd mycell": "needs a folder mycell",
-}
-"""Commands that cannot run here, wherever they stand, and the reason."""
-PYTHON_NOT_RUN = {r'f"\{url\}/': "is a part of a program"}
-YAML_NOT_RUN = {
-    r"^scrape_configs:": "is read by Prometheus",
-    r"\w:\.\.\.": "has an ellipsis in place of a value",
-}
-NOT_RUN = {"sh": SHELL_NOT_RUN, "python": PYTHON_NOT_RUN, "yaml": YAML_NOT_RUN, "js": {r"": "needs a browser"}}
+LANGUAGES = {"sh", "python", "yaml", "js"}
+NO_BROWSER = "needs a browser"
+"""The reason of every block in JavaScript."""
 
 
 class Block(NamedTuple):
@@ -81,9 +64,8 @@ def blocks(page: str) -> Iterator[Block]:
         if language in OUTPUT:
             continue
         comment = REASON.search(page[: match.start()])
-        general = (why for what, why in NOT_RUN.get(language, {}).items() if re.search(what, code, re.MULTILINE))
-        line = page.count("\n", 0, match.start()) + 1
-        yield Block(line, language, code, comment[1] if comment else next(general, None))
+        reason = comment[1] if comment else NO_BROWSER if language == "js" else None
+        yield Block(page.count("\n", 0, match.start()) + 1, language, code, reason)
 
 
 ALL = [(page.relative_to(CHECKOUT).as_posix(), block) for page in PAGES for block in blocks(page.read_text("utf-8"))]
@@ -117,7 +99,7 @@ def _no_token(keys: dict[str, Any]) -> bool:
 
 
 def test_every_block_is_in_a_language_that_is_run() -> None:
-    unknown = [f"{page}:{block.line}: {block.language}" for page, block in ALL if block.language not in NOT_RUN]
+    unknown = [f"{page}:{block.line}: {block.language}" for page, block in ALL if block.language not in LANGUAGES]
     assert not unknown, "write `sh`, `python` or `yaml`; `text` for what is printed"
     assert len(ALL) > 30
 
@@ -187,8 +169,8 @@ def test_a_block_says_why_it_is_not_run() -> None:
     assert list(blocks(page)) == [
         Block(3, "python", "x\n", "needs a camera"),
         Block(7, "python", "y\n", None),
-        Block(13, "sh", "sudo x\n", "needs root"),
-        Block(19, "js", "z\n", "needs a browser"),
+        Block(13, "sh", "sudo x\n", None),
+        Block(19, "js", "z\n", NO_BROWSER),
     ]
 
 

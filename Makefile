@@ -4,7 +4,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-accuracy bench-pipeline bench-board bench-master bench-scale bench-latency soak bench-pose-monitor bench-paper viewer-test rehearsal image-test fresh-machine pictures test lint clean
+.PHONY: help demo real sweeps right-time source-faults faults plug-and-play bench bench-accuracy bench-pipeline bench-board bench-master bench-scale bench-latency soak bench-pose-monitor bench-paper viewer-test rehearsal image-test fresh-machine pictures docs test lint clean
 
 ARGS ?=
 MINUTES ?= 30
@@ -18,7 +18,9 @@ WORKERS ?= logical
 NO_TESTS := 5
 READY := $(VENV)/ready
 BENCH_READY := $(VENV)/ready-bench
+DOCS_READY := $(VENV)/ready-docs
 TYPED := $(patsubst %/,%,$(dir $(wildcard $(addsuffix /__init__.py,shared geometry edge_unit master_server simulation benchmarks qualification))))
+SCRIPTS := $(wildcard scripts/*.py examples/*.py examples/*/*.py)
 
 # Recorded data beside the checkout, if it exists.
 ifneq ($(wildcard ../shared/data),)
@@ -97,6 +99,10 @@ pictures: $(READY) ## the pictures of the README and of docs/architecture.md, ma
 	@$(BIN)/python -m simulation.demo.window_pictures assets/pictures
 	@$(BIN)/python scripts/draw_architecture.py
 
+docs: $(DOCS_READY) ## the documentation as a site in out/site; fails on a dead link or a missing docstring
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build -q --strict --clean
+	@echo "out/site/index.html can be opened; for its search: $(BIN)/python -m http.server -d out/site"
+
 test: $(READY) lint ## lint, then all tests except the slow ones; SLOW=1 includes them
 	@failed=0; \
 	$(PYTEST) -n $(WORKERS) -m "not alone$(if $(SLOW),, and not slow)" $(ARGS) || [ $$? -eq $(NO_TESTS) ] || failed=1; \
@@ -107,7 +113,7 @@ lint: $(READY) ## ruff, and mypy for this Python and for 3.10
 	@failed=0; \
 	$(BIN)/ruff check -q . || failed=1; \
 	$(BIN)/ruff format -q --check . || failed=1; \
-	$(if $(TYPED),$(BIN)/mypy --no-error-summary $(TYPED) || failed=1; \
+	$(if $(TYPED),$(BIN)/mypy --no-error-summary $(TYPED) $(SCRIPTS) || failed=1; \
 	$(BIN)/mypy --no-error-summary --config-file scripts/mypy-3.10.ini $(TYPED) || failed=1;) \
 	exit $$failed
 
@@ -127,4 +133,9 @@ $(READY): pyproject.toml constraints.txt
 $(BENCH_READY): $(READY)
 	@echo "adding the peers of the benchmarks to $(VENV) (some 2 GB)"
 	@$(BIN)/python -m pip install -q -c constraints.txt --build-constraint constraints.txt -e '.[$(EXTRAS),bench]'
+	@touch $@
+
+# What makes the site of the documentation.
+$(DOCS_READY): $(READY)
+	@$(BIN)/python -m pip install -q -c constraints.txt --build-constraint constraints.txt -e '.[$(EXTRAS),docs]'
 	@touch $@

@@ -23,7 +23,7 @@ PACKAGES = ("shared", "geometry", "edge_unit", "master_server", "simulation", "b
 PACKAGE = "|".join(PACKAGES)
 DOTTED = re.compile(rf"(?<![\w./@:-])(?:{PACKAGE})(?:\.[A-Za-z_]\w*)+")
 # Not `../shared/data`, which lies beside a checkout, nor a part of a longer path.
-FOLDERS = (*PACKAGES, "deploy", "assets", "docs", "scripts", r"\.ci")
+FOLDERS = (*PACKAGES, "deploy", "assets", "docs", "examples", "scripts", r"\.ci")
 PATH = re.compile(rf"(?<![\w./<{{$*-])(?:{'|'.join(FOLDERS)})(?:/[\w.*-]+)+/?")
 RUN_AS_MODULE = re.compile(rf"""-m["']?[,\s]\s*["']?((?:{PACKAGE})(?:\.\w+)*)(?![\w.])""")
 IMPORTED = re.compile(rf"^[ >.]*from ((?:{PACKAGE})[\w.]*) import ([\w, ]+)$", re.MULTILINE)

@@ -14,7 +14,7 @@ from edge_unit.daemon.pipeline_manager import AssignedPipeline
 from edge_unit.daemon.refinement_task import Refining
 from edge_unit.daemon.report import health_of, parts_of, troubled, within_bounds
 from edge_unit.joints import JointEstimate
-from edge_unit.monitoring import Stages, Stance
+from edge_unit.monitoring import PoseMonitor, Stages
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.sources.frame import DepthFrame
 from edge_unit.uplink.assignment import Assignment, Report, Trouble
@@ -41,7 +41,7 @@ class FrameWork:
         assigned: AssignedPipeline,
         learning: Learning,
         refining: Refining,
-        stance: Stance,
+        stance: PoseMonitor,
         joints: FrameJoints,
     ) -> None:
         """`finish` is told what became of a command."""

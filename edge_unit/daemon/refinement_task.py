@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from edge_unit.daemon.background_learning import POSE_CHANGED
 from edge_unit.daemon.pipeline_manager import AssignedPipeline
 from edge_unit.joints import JointEstimate
-from edge_unit.monitoring import Stance
+from edge_unit.monitoring import PoseMonitor
 from edge_unit.pipeline import DepthPipeline, Refiner
 from edge_unit.uplink.uplink import Uplink
 from shared.errors import CellwatchError
@@ -37,7 +37,7 @@ class Gathered:
 class Refining:
     """One unit's refinements, one at a time."""
 
-    def __init__(self, uplink: Uplink, assigned: AssignedPipeline, stance: Stance) -> None:
+    def __init__(self, uplink: Uplink, assigned: AssignedPipeline, stance: PoseMonitor) -> None:
         self._uplink = uplink
         self._assigned = assigned
         self._stance = stance

@@ -29,7 +29,7 @@ from edge_unit.daemon.report import troubled
 from edge_unit.daemon.task_group import Errands
 from edge_unit.daemon.unit_status import UnitStatus
 from edge_unit.daemon.warm_up import rehearse
-from edge_unit.monitoring import CameraStanding, Progress, Stages, Stance, Trace, boot_id
+from edge_unit.monitoring import CameraStanding, PoseMonitor, Progress, Stages, Trace, boot_id
 from edge_unit.source_factory import is_recording
 from edge_unit.sources.frame import DepthFrame, DepthSource
 from edge_unit.sources.status import ReportsStatus
@@ -99,7 +99,7 @@ class Unit:
 
     def _frame_work(self) -> FrameWork:
         config, finish = self._config, self.uplink.finish
-        stance = Stance(config.state_dir)
+        stance = PoseMonitor(config.state_dir)
         learning = Learning(BackgroundStore(config.state_dir), config.learn_background_frames, finish)
         assigned = AssignedPipeline(learning, stance)
         refining = Refining(self.uplink, assigned, stance)

@@ -14,7 +14,7 @@ In the order of the flow:
 
 from edge_unit.monitoring.camera_status import CameraStanding
 from edge_unit.monitoring.host import boot_id, clock_is_set, usb_cameras
-from edge_unit.monitoring.pose_monitor import Stance, Verdict, place_of
+from edge_unit.monitoring.pose_monitor import PoseMonitor, Verdict, place_of
 from edge_unit.monitoring.stage_timer import Stages
 from edge_unit.monitoring.stall_detector import Progress
 from edge_unit.monitoring.trace import Trace, TraceRecord, read_trace
@@ -23,7 +23,7 @@ __all__ = [
     "CameraStanding",
     "Progress",
     "Stages",
-    "Stance",
+    "PoseMonitor",
     "Trace",
     "TraceRecord",
     "Verdict",

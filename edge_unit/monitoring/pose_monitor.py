@@ -121,7 +121,7 @@ class _Fit:
 _NOTHING = _Fit(0, np.zeros(6), np.zeros(6), 0.0, 0.0)
 
 
-class Stance:
+class PoseMonitor:
     """Judges one camera by how its frames fit what is known, against how they used to."""
 
     def __init__(self, state_dir: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_unit.monitoring import Stance, Verdict, place_of
+from edge_unit.monitoring import PoseMonitor, Verdict, place_of
 from edge_unit.monitoring.pose_monitor import BASELINE_LOOKS, FILE_NAME, PERIOD_S, WINDOW
 from edge_unit.pipeline import DepthPipeline, Misfit
 from shared.transforms import Transform, from_xyz_rpy
@@ -37,7 +37,7 @@ class Watched:
 
     def restart(self) -> None:
         """As a unit that was switched off and on."""
-        self.stance = Stance(self.folder)
+        self.stance = PoseMonitor(self.folder)
         self.stance.begin(place_of("SERIAL", EYE.shape, self.pose))
 
     def looks(self, count: int, knock: Transform = HERE, share: float = 1.0) -> Iterator[Verdict]:
@@ -156,7 +156,7 @@ def misfit_of(watched: Watched) -> Misfit:
 
 
 def test_looks_are_due_again_after_a_while_and_when_time_begins_anew(tmp_path: Path) -> None:
-    stance = Stance(tmp_path)
+    stance = PoseMonitor(tmp_path)
     look = Misfit(np.zeros(6), np.ones(6), 1.0, 0.0, 1.0)
     assert stance.due(10_000_000_000)
     stance.judge(look, 0, 10_000_000_000)

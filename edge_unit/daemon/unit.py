@@ -29,7 +29,7 @@ from edge_unit.daemon.report import troubled
 from edge_unit.daemon.task_group import Errands
 from edge_unit.daemon.unit_status import UnitStatus
 from edge_unit.daemon.warm_up import rehearse
-from edge_unit.monitoring import CameraStanding, PoseMonitor, Progress, Stages, Trace, boot_id
+from edge_unit.monitoring import CameraStatus, PoseMonitor, Progress, Stages, Trace, boot_id
 from edge_unit.source_factory import is_recording
 from edge_unit.sources.frame import DepthFrame, DepthSource
 from edge_unit.sources.status import ReportsStatus
@@ -86,7 +86,7 @@ class Unit:
             self._note,
             self._masters,
         )
-        self._camera = CameraStanding(config, self.uplink)
+        self._camera = CameraStatus(config, self.uplink)
         self._trace = None if config.trace_path is None else Trace(config.trace_path)
         self._search = BoardSearch(source, config.board_stream)
         self._work = self._frame_work()

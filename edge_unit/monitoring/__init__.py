@@ -12,7 +12,7 @@ In the order of the flow:
     trace           what was reported, frame by frame, in a file
 """
 
-from edge_unit.monitoring.camera_status import CameraStanding
+from edge_unit.monitoring.camera_status import CameraStatus
 from edge_unit.monitoring.host import boot_id, clock_is_set, usb_cameras
 from edge_unit.monitoring.pose_monitor import PoseMonitor, Verdict, place_of
 from edge_unit.monitoring.stage_timer import Stages
@@ -20,7 +20,7 @@ from edge_unit.monitoring.stall_detector import Progress
 from edge_unit.monitoring.trace import Trace, TraceRecord, read_trace
 
 __all__ = [
-    "CameraStanding",
+    "CameraStatus",
     "Progress",
     "Stages",
     "PoseMonitor",

@@ -19,7 +19,7 @@ from shared.transforms import Transform
 logger = logging.getLogger(__name__)
 
 
-class CameraStanding:
+class CameraStatus:
     """One unit's camera, as the master is told of it."""
 
     def __init__(self, config: UnitConfig, uplink: Uplink) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from edge_unit.config import UnitConfig
-from edge_unit.monitoring import CameraStanding
+from edge_unit.monitoring import CameraStatus
 from edge_unit.monitoring.last_camera import CameraMemory
 from edge_unit.sources.frame import CameraInfo
 from edge_unit.sources.realsense.source import RealsenseSourceConfig
@@ -33,9 +33,9 @@ class Told:
         self.cameras.append(camera)
 
 
-def standing(folder: Path, serial: str | None = None) -> tuple[CameraStanding, Any]:
+def standing(folder: Path, serial: str | None = None) -> tuple[CameraStatus, Any]:
     told: Any = Told()
-    return CameraStanding(UnitConfig(source=RealsenseSourceConfig(serial=serial), state_dir=folder), told), told
+    return CameraStatus(UnitConfig(source=RealsenseSourceConfig(serial=serial), state_dir=folder), told), told
 
 
 @pytest.mark.parametrize(("wanted", "expected"), [(None, [CAMERA]), ("123", [CAMERA]), ("456", [])])

@@ -8,7 +8,7 @@ from collections.abc import Coroutine
 from typing import Any
 
 
-class Errands:
+class TaskGroup:
     """Tasks that end by themselves, or with the unit."""
 
     def __init__(self) -> None:

@@ -26,7 +26,7 @@ from edge_unit.daemon.joint_lookup import FrameJoints
 from edge_unit.daemon.pipeline_manager import AssignedPipeline
 from edge_unit.daemon.refinement_task import Refining
 from edge_unit.daemon.report import troubled
-from edge_unit.daemon.task_group import Errands
+from edge_unit.daemon.task_group import TaskGroup
 from edge_unit.daemon.unit_status import UnitStatus
 from edge_unit.daemon.warm_up import rehearse
 from edge_unit.monitoring import CameraStatus, PoseMonitor, Progress, Stages, Trace, boot_id
@@ -90,7 +90,7 @@ class Unit:
         self._trace = None if config.trace_path is None else Trace(config.trace_path)
         self._search = BoardSearch(source, config.board_stream)
         self._work = self._frame_work()
-        self._errands = Errands()
+        self._errands = TaskGroup()
         self._showing = Showing(self.uplink, self._work.assigned, self._errands)
         self._progress = Progress()
         self._rehearsal: asyncio.Task[None] | None = None

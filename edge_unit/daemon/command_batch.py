@@ -11,7 +11,7 @@ from shared.messages import Command
 
 
 @dataclass(frozen=True)
-class Orders:
+class CommandBatch:
     """Commands: in place of a frame, before it is filtered, or afterwards with what it showed."""
 
     calibrations: list[Command] = field(default_factory=list)
@@ -19,7 +19,7 @@ class Orders:
     pictures: list[Command] = field(default_factory=list)
 
     @classmethod
-    def take(cls, queue: asyncio.Queue[Command]) -> Orders:
+    def take(cls, queue: asyncio.Queue[Command]) -> CommandBatch:
         """All that wait."""
         orders = cls()
         while not queue.empty():

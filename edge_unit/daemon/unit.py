@@ -18,7 +18,7 @@ from edge_unit.config import UnitConfig
 from edge_unit.daemon.background_learning import Learning
 from edge_unit.daemon.background_store import BackgroundStore
 from edge_unit.daemon.calibration_task import localise
-from edge_unit.daemon.command_batch import Orders, put_back
+from edge_unit.daemon.command_batch import CommandBatch, put_back
 from edge_unit.daemon.frame_limiter import FrameLimiter
 from edge_unit.daemon.frame_processor import FrameWork
 from edge_unit.daemon.image_requests import NO_POSE, Showing
@@ -207,7 +207,7 @@ class Unit:
         assignment = self.uplink.assignment or self._work.assigned.assignment
         if assignment is None:
             return
-        orders = Orders.take(self.uplink.commands)
+        orders = CommandBatch.take(self.uplink.commands)
         if orders.calibrations:
             put_back(self.uplink.commands, (*orders.changes, *orders.pictures))
             # The frame is of before the look, and its memory may be gone afterwards.
@@ -218,7 +218,7 @@ class Unit:
         else:
             await self._filter(assignment, assignment.T_world_camera, frame, orders)
 
-    async def _look_for_pose(self, assignment: Assignment, frame: DepthFrame, orders: Orders) -> None:
+    async def _look_for_pose(self, assignment: Assignment, frame: DepthFrame, orders: CommandBatch) -> None:
         """Say that nobody knows where the camera stands, and look for the board now and then."""
         self._work.assigned.pipeline = None
         self._finish(orders.changes, Outcome("refused", NO_POSE))
@@ -233,7 +233,7 @@ class Unit:
             await localise(self._search, self.uplink, assignment, frame)
 
     async def _filter(
-        self, assignment: Assignment, T_world_camera: Transform, frame: DepthFrame, orders: Orders
+        self, assignment: Assignment, T_world_camera: Transform, frame: DepthFrame, orders: CommandBatch
     ) -> None:
         """Process the frame and offer the result; nothing that follows delays it."""
         stages = Stages(frame.captured_at_ns)

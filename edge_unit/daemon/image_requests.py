@@ -22,7 +22,7 @@ from shared.messages import Command, ImageKind, Outcome
 NO_POSE = "the pose of its camera is not known yet"
 
 
-class Showing:
+class ImageRequests:
     """One unit's pictures."""
 
     def __init__(self, uplink: Uplink, assigned: AssignedPipeline, tasks: TaskGroup) -> None:

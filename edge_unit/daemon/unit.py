@@ -21,7 +21,7 @@ from edge_unit.daemon.calibration_task import localise
 from edge_unit.daemon.command_batch import CommandBatch, put_back
 from edge_unit.daemon.frame_limiter import FrameLimiter
 from edge_unit.daemon.frame_processor import FrameWork
-from edge_unit.daemon.image_requests import NO_POSE, Showing
+from edge_unit.daemon.image_requests import NO_POSE, ImageRequests
 from edge_unit.daemon.joint_lookup import FrameJoints
 from edge_unit.daemon.pipeline_manager import AssignedPipeline
 from edge_unit.daemon.refinement_task import Refining
@@ -91,7 +91,7 @@ class Unit:
         self._search = BoardSearch(source, config.board_stream)
         self._work = self._frame_work()
         self._errands = TaskGroup()
-        self._showing = Showing(self.uplink, self._work.assigned, self._errands)
+        self._showing = ImageRequests(self.uplink, self._work.assigned, self._errands)
         self._progress = Progress()
         self._rehearsal: asyncio.Task[None] | None = None
         self._limiter = FrameLimiter(config.fps_max)

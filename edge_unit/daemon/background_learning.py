@@ -33,7 +33,7 @@ class _Lesson:
     command: Command | None
 
 
-class Learning:
+class BackgroundLearning:
     """What one unit has learned of its cell, and what it is learning."""
 
     def __init__(self, store: BackgroundStore, frames: int | None, finish: Callable[[Command, Outcome], None]) -> None:

@@ -8,7 +8,7 @@ import logging
 from collections.abc import Callable, Coroutine, Iterable, Iterator
 from typing import Any
 
-from edge_unit.daemon.background_learning import Learning
+from edge_unit.daemon.background_learning import BackgroundLearning
 from edge_unit.daemon.joint_lookup import FrameJoints, known
 from edge_unit.daemon.pipeline_manager import AssignedPipeline
 from edge_unit.daemon.refinement_task import Refining
@@ -39,7 +39,7 @@ class FrameWork:
         self,
         finish: Callable[[Command, Outcome], None],
         assigned: AssignedPipeline,
-        learning: Learning,
+        learning: BackgroundLearning,
         refining: Refining,
         stance: PoseMonitor,
         joints: FrameJoints,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_unit.daemon.background_learning import Learning
+from edge_unit.daemon.background_learning import BackgroundLearning
 from edge_unit.daemon.background_store import Place
 from edge_unit.daemon.warm_up import warm_up
 from edge_unit.monitoring import PoseMonitor, place_of
@@ -26,7 +26,7 @@ class AssignedPipeline:
         refined: a pose that may come with an assignment although the camera did not move.
     """
 
-    def __init__(self, learning: Learning, stance: PoseMonitor) -> None:
+    def __init__(self, learning: BackgroundLearning, stance: PoseMonitor) -> None:
         self._learning = learning
         self._stance = stance
         self.camera: CameraInfo | None = None

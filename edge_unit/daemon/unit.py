@@ -15,7 +15,7 @@ from contextlib import aclosing, suppress
 
 from edge_unit.calibration.board_scan import BoardSearch
 from edge_unit.config import UnitConfig
-from edge_unit.daemon.background_learning import Learning
+from edge_unit.daemon.background_learning import BackgroundLearning
 from edge_unit.daemon.background_store import BackgroundStore
 from edge_unit.daemon.calibration_task import localise
 from edge_unit.daemon.command_batch import CommandBatch, put_back
@@ -100,7 +100,7 @@ class Unit:
     def _frame_work(self) -> FrameWork:
         config, finish = self._config, self.uplink.finish
         stance = PoseMonitor(config.state_dir)
-        learning = Learning(BackgroundStore(config.state_dir), config.learn_background_frames, finish)
+        learning = BackgroundLearning(BackgroundStore(config.state_dir), config.learn_background_frames, finish)
         assigned = AssignedPipeline(learning, stance)
         refining = Refining(self.uplink, assigned, stance)
         return FrameWork(finish, assigned, learning, refining, stance, FrameJoints(self.uplink))

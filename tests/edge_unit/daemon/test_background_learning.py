@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_unit.daemon.background_learning import Learning
+from edge_unit.daemon.background_learning import BackgroundLearning
 from edge_unit.daemon.background_store import BackgroundStore, Place
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.sources.frame import CameraInfo
@@ -33,7 +33,7 @@ class Student:
         self.details: list[str] = []
         self.pipeline = DepthPipeline(CAMERA, POSE, Cell("bare", np.full(3, -1.0), np.full(3, 1.0)))
         store = BackgroundStore(folder)
-        self.learning = Learning(store, frames, self.finish)
+        self.learning = BackgroundLearning(store, frames, self.finish)
 
     def finish(self, command: Command, outcome: Outcome) -> None:
         self.told.append((command.id, outcome.code))

@@ -26,7 +26,7 @@ from shared.wire import keys_to_bytes
 logger = logging.getLogger(__name__)
 
 
-class FrameWork:
+class FrameProcessor:
     """From a frame to its report. Not for use from several threads at once.
 
     Attributes:

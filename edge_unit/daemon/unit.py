@@ -20,7 +20,7 @@ from edge_unit.daemon.background_store import BackgroundStore
 from edge_unit.daemon.calibration_task import localise
 from edge_unit.daemon.command_batch import CommandBatch, put_back
 from edge_unit.daemon.frame_limiter import FrameLimiter
-from edge_unit.daemon.frame_processor import FrameWork
+from edge_unit.daemon.frame_processor import FrameProcessor
 from edge_unit.daemon.image_requests import NO_POSE, ImageRequests
 from edge_unit.daemon.joint_lookup import FrameJoints
 from edge_unit.daemon.pipeline_manager import AssignedPipeline
@@ -97,13 +97,13 @@ class Unit:
         self._limiter = FrameLimiter(config.fps_max)
         self._status = UnitStatus(monotonic_ns())
 
-    def _frame_work(self) -> FrameWork:
+    def _frame_work(self) -> FrameProcessor:
         config, finish = self._config, self.uplink.finish
         stance = PoseMonitor(config.state_dir)
         learning = BackgroundLearning(BackgroundStore(config.state_dir), config.learn_background_frames, finish)
         assigned = AssignedPipeline(learning, stance)
         refining = Refining(self.uplink, assigned, stance)
-        return FrameWork(finish, assigned, learning, refining, stance, FrameJoints(self.uplink))
+        return FrameProcessor(finish, assigned, learning, refining, stance, FrameJoints(self.uplink))
 
     async def run(self) -> None:
         """Watch and report.

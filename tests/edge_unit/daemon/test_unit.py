@@ -23,7 +23,7 @@ from edge_unit.calibration.board_layout import BoardLayout
 from edge_unit.config import PoseConfig, UnitConfig
 from edge_unit.daemon import report as reporting_module
 from edge_unit.daemon import unit as unit_module
-from edge_unit.daemon.frame_processor import FrameWork
+from edge_unit.daemon.frame_processor import FrameProcessor
 from edge_unit.daemon.joint_lookup import FrameJoints
 from edge_unit.daemon.refinement_task import REFINE_FRAMES
 from edge_unit.daemon.unit import Unit
@@ -228,7 +228,7 @@ async def test_a_frame_that_hangs_is_told_and_waiting_for_a_camera_is_not(
         await bench.until(lambda: bench.source.opened >= 2, "a camera that is opened again")
         bench.show(patch(1225))
         await bench.until(lambda: (row := bench.row()) and row.health.frame == 1, "a frame")
-        monkeypatch.setattr(FrameWork, "process", lambda *_: release.wait(30.0))
+        monkeypatch.setattr(FrameProcessor, "process", lambda *_: release.wait(30.0))
         bench.show(patch(1225))
         stuck = await bench.until(bench.unit.stuck, "a frame that hangs")
         assert stuck.startswith("frame 2 has not come to its end for 0 s")
@@ -363,13 +363,13 @@ async def test_another_master_never_gets_voxels_of_the_first_ones_lattice(tmp_pa
 async def test_joints_of_the_frames_time_reach_the_pipeline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = await asyncio.to_thread(Bench, tmp_path, with_robot=True)
     used: list[Any] = []
-    report = FrameWork._report
+    report = FrameProcessor._report
 
     def spy(work: Any, pipeline: Any, assignment: Any, frame: Any, joints: Any, stages: Any) -> Any:
         used.append(joints)
         return report(work, pipeline, assignment, frame, joints, stages)
 
-    monkeypatch.setattr(FrameWork, "_report", spy)
+    monkeypatch.setattr(FrameProcessor, "_report", spy)
     async with bench.running():
         bench.show(patch(FAR_MM))
         await bench.until(lambda: used, "a frame without joints")
@@ -391,7 +391,7 @@ async def test_joints_whose_times_are_late_are_looked_up_later(tmp_path: Path, m
     """The robot turns at 1 rad/s; the delay is told while the unit runs."""
     bench = await asyncio.to_thread(Bench, tmp_path, with_robot=True)
     ahead_s: list[float | None] = []
-    report = FrameWork._report
+    report = FrameProcessor._report
     began_ns = monotonic_ns()
 
     def turned(at_ns: int) -> float:
@@ -415,7 +415,7 @@ async def test_joints_whose_times_are_late_are_looked_up_later(tmp_path: Path, m
             if ahead_s[-1] is not None:
                 return ahead_s[-1]
 
-    monkeypatch.setattr(FrameWork, "_report", spy)
+    monkeypatch.setattr(FrameProcessor, "_report", spy)
     async with bench.running():
         assert await ahead() == pytest.approx(0.0, abs=0.02)
         bench.master.change_settings({"joint_delay_s": 0.05})

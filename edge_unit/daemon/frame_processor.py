@@ -11,7 +11,7 @@ from typing import Any
 from edge_unit.daemon.background_learning import BackgroundLearning
 from edge_unit.daemon.joint_lookup import FrameJoints, known
 from edge_unit.daemon.pipeline_manager import AssignedPipeline
-from edge_unit.daemon.refinement_task import Refining
+from edge_unit.daemon.refinement_task import RefinementTask
 from edge_unit.daemon.report import health_of, parts_of, troubled, within_bounds
 from edge_unit.joints import JointEstimate
 from edge_unit.monitoring import PoseMonitor, Stages
@@ -40,7 +40,7 @@ class FrameProcessor:
         finish: Callable[[Command, Outcome], None],
         assigned: AssignedPipeline,
         learning: BackgroundLearning,
-        refining: Refining,
+        refining: RefinementTask,
         stance: PoseMonitor,
         joints: FrameJoints,
     ) -> None:

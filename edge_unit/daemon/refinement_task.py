@@ -34,7 +34,7 @@ class Gathered:
     refiner: Refiner
 
 
-class Refining:
+class RefinementTask:
     """One unit's refinements, one at a time."""
 
     def __init__(self, uplink: Uplink, assigned: AssignedPipeline, stance: PoseMonitor) -> None:

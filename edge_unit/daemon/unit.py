@@ -24,7 +24,7 @@ from edge_unit.daemon.frame_processor import FrameProcessor
 from edge_unit.daemon.image_requests import NO_POSE, ImageRequests
 from edge_unit.daemon.joint_lookup import FrameJoints
 from edge_unit.daemon.pipeline_manager import AssignedPipeline
-from edge_unit.daemon.refinement_task import Refining
+from edge_unit.daemon.refinement_task import RefinementTask
 from edge_unit.daemon.report import troubled
 from edge_unit.daemon.task_group import TaskGroup
 from edge_unit.daemon.unit_status import UnitStatus
@@ -102,7 +102,7 @@ class Unit:
         stance = PoseMonitor(config.state_dir)
         learning = BackgroundLearning(BackgroundStore(config.state_dir), config.learn_background_frames, finish)
         assigned = AssignedPipeline(learning, stance)
-        refining = Refining(self.uplink, assigned, stance)
+        refining = RefinementTask(self.uplink, assigned, stance)
         return FrameProcessor(finish, assigned, learning, refining, stance, FrameJoints(self.uplink))
 
     async def run(self) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import aclosing
 
 from edge_unit.calibration.board_pose import BoardLocaliser, Localisation
-from edge_unit.sources.image import ImageStream, LooksAtBoard
+from edge_unit.sources.image import ImageSource, ImageStream
 from shared.cell import Board
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import BoardError, SourceError
@@ -35,7 +35,7 @@ class BoardSearch:
     """One unit's search for its cell's board."""
 
     def __init__(self, source: object, stream: ImageStream) -> None:
-        """A `source` that does not `LooksAtBoard` has no pictures to look at."""
+        """A `source` that does not `ImageSource` has no pictures to look at."""
         self._source = source
         self._stream: ImageStream = stream
         self._retry_s = RETRY_MIN_S
@@ -45,7 +45,7 @@ class BoardSearch:
     @property
     def possible(self) -> bool:
         """Whether the source has pictures of the board at all."""
-        return isinstance(self._source, LooksAtBoard)
+        return isinstance(self._source, ImageSource)
 
     def due(self, now_ns: int) -> bool:
         """Whether to look again, after what was found before."""
@@ -64,7 +64,7 @@ class BoardSearch:
             SourceError: the camera delivers no pictures.
         """
         source = self._source
-        if not isinstance(source, LooksAtBoard):
+        if not isinstance(source, ImageSource):
             raise BoardError("this unit's source has no pictures in which to look for the board")
         begun_ns = monotonic_ns()
         try:

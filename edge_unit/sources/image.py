@@ -45,7 +45,7 @@ class ImageFrame:
     frame_number: int
 
 
-class ImageLook(Protocol):
+class ImageFeed(Protocol):
     """Pictures of one image stream, while depth pauses."""
 
     @property
@@ -63,10 +63,10 @@ class ImageLook(Protocol):
 
 
 @runtime_checkable
-class LooksAtBoard(Protocol):
+class ImageSource(Protocol):
     """A source that can deliver pictures of another stream, the emitter off, for as long as the context lasts."""
 
-    def look(self, stream: ImageStream) -> AbstractAsyncContextManager[ImageLook]:
+    def look(self, stream: ImageStream) -> AbstractAsyncContextManager[ImageFeed]:
         """Pause depth and begin; depth goes on afterwards by itself.
 
         Raises:

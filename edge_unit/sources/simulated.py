@@ -70,8 +70,8 @@ class SimulatedSourceConfig(BaseModel):
         return f"SIM{self.seed:05d}{self.camera:02d}"
 
 
-class SimulatedLook:
-    """Pictures of the board as the simulated camera takes them; an `ImageLook`."""
+class SimulatedImages:
+    """Pictures of the board as the simulated camera takes them; an `ImageFeed`."""
 
     def __init__(self, camera: BoardCamera, hands: Hands, worker: ThreadPoolExecutor, epoch_ns: int) -> None:
         self._camera = camera
@@ -81,13 +81,13 @@ class SimulatedLook:
 
     @property
     def info(self) -> ImageInfo:
-        """See `ImageLook`."""
+        """See `ImageFeed`."""
         return ImageInfo(
             self._camera.stream, self._camera.intrinsics, (0.0,) * 5, "brown_conrady", self._camera.T_depth_image
         )
 
     async def images(self) -> AsyncGenerator[ImageFrame, None]:
-        """See `ImageLook`; taken as fast as they are wanted."""
+        """See `ImageFeed`; taken as fast as they are wanted."""
         loop = asyncio.get_running_loop()
         for number in itertools.count():
             now_ns = monotonic_ns()
@@ -152,14 +152,14 @@ class SimulatedSource:
             yield DepthFrame(frame.depth, due_ns, number)
 
     @asynccontextmanager
-    async def look(self, stream: ImageStream) -> AsyncIterator[SimulatedLook]:
-        """See `LooksAtBoard`."""
+    async def look(self, stream: ImageStream) -> AsyncIterator[SimulatedImages]:
+        """See `ImageSource`."""
         worker = self._worker
         if worker is None:
             raise SourceError("simulated camera: a look was asked for before it was opened")
         eye = await asyncio.get_running_loop().run_in_executor(worker, self._board_camera, stream)
         assert self._hands is not None
-        yield SimulatedLook(eye, self._hands, worker, self._config.epoch_ns)
+        yield SimulatedImages(eye, self._hands, worker, self._config.epoch_ns)
 
     async def close(self) -> None:
         """See `DepthSource`."""

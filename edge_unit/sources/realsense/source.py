@@ -178,7 +178,7 @@ class RealsenseSource:
     # ------------------------------------------------------------------ the calibration board
 
     @asynccontextmanager
-    async def look(self, stream: ImageStream) -> AsyncIterator[Look]:
+    async def look(self, stream: ImageStream) -> AsyncIterator[RealsenseImages]:
         """Pictures of another stream, the emitter off; depth pauses meanwhile, and goes on afterwards by itself.
 
         Raises:
@@ -192,7 +192,7 @@ class RealsenseSource:
         images.begin()
         try:
             opened = await images.first_opened(self._config.open_timeout_s)
-            yield Look(image_info(opened), images)
+            yield RealsenseImages(image_info(opened), images)
         finally:
             await images.close()
             if self._supervisor is depth:

@@ -25,7 +25,7 @@ from benchmarks.joint_delivery import Delivered, Delivery
 from benchmarks.reporting.report import RESULTS, Mark, Result, line, write
 from benchmarks.sweep_scenes.stage import reported_at
 from benchmarks.sweeps import runner
-from edge_unit.joints import DelayEstimate, DelayLook, JointEstimate, estimate_delay
+from edge_unit.joints import DelayComparison, DelayEstimate, JointEstimate, estimate_delay
 from edge_unit.joints import look_at as look_at_frame
 from edge_unit.joints.delay_monitor import LOOKS_MAX
 from edge_unit.pipeline import DepthPipeline, Voxels
@@ -285,7 +285,7 @@ def find_delays(name: str, at_corner: bool, looks: int, intrinsics: Intrinsics) 
     settings = Settings()
     static_m = DepthPipeline(intrinsics, pose, world.cell, settings).expected_depth(None)
     assert world.cell.robot is not None
-    look = DelayLook(intrinsics, pose, world.cell.robot, static_m, settings)
+    look = DelayComparison(intrinsics, pose, world.cell.robot, static_m, settings)
     frames = [(camera.capture(number * LOOK_S).depth, number * LOOK_S) for number in range(looks)]
     found = []
     for delay_s in DELAYS_S:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edge_unit.joints import DelayWatch, JointEstimate
+from edge_unit.joints import DelayMonitor, JointEstimate
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.pipeline.moving_model import EXACT
 from edge_unit.sources.frame import DepthFrame
@@ -22,7 +22,7 @@ class FrameJoints:
 
     def __init__(self, uplink: Uplink) -> None:
         self._uplink = uplink
-        self._delay = DelayWatch()
+        self._delay = DelayMonitor()
 
     async def at(self, assignment: Assignment, frame: DepthFrame) -> JointEstimate | None:
         """Where the robot was when the frame was taken; None when nobody knows."""
@@ -49,7 +49,7 @@ class FrameJoints:
         if frame.joints is not None or not clock.known:
             return None
         at_ns = frame.captured_at_ns + clock.offset_ns
-        look = self._delay.next_look(self._uplink.joints)
+        look = self._delay.next_comparison(self._uplink.joints)
         if self._delay.due(at_ns):
             self._delay.keep(pipeline, frame.depth, at_ns)
         return look

@@ -9,15 +9,15 @@ In the order of the flow:
     delay_monitor         the same while a unit runs, as a warning
 """
 
-from edge_unit.joints.delay_estimation import DelayEstimate, DelayLook, estimate_delay, look_at
+from edge_unit.joints.delay_estimation import DelayComparison, DelayEstimate, estimate_delay, look_at
 from edge_unit.joints.delay_from_recording import delay_of_recording
-from edge_unit.joints.delay_monitor import DelayWatch
+from edge_unit.joints.delay_monitor import DelayMonitor
 from edge_unit.joints.history import JointEstimate, JointHistory
 
 __all__ = [
     "DelayEstimate",
-    "DelayLook",
-    "DelayWatch",
+    "DelayComparison",
+    "DelayMonitor",
     "JointEstimate",
     "JointHistory",
     "delay_of_recording",

@@ -57,7 +57,7 @@ class DelayEstimate:
     looks: int
 
 
-class DelayLook:
+class DelayComparison:
     """Compares frames of one camera with the robot as it would have stood at each of `DELAYS_S`."""
 
     def __init__(
@@ -126,7 +126,7 @@ class DelayLook:
 
 
 def estimate_delay(misfits: Collection[NDArray[np.float64]]) -> DelayEstimate:
-    """The delay by looks of `DelayLook.misfits`.
+    """The delay by looks of `DelayComparison.misfits`.
 
     Raises:
         InputError: there are too few looks, for the robot hardly moved; or no delay fits better than all others.
@@ -161,7 +161,7 @@ def _best(curve: NDArray[np.float64]) -> float:
 
 
 def look_at(
-    look: DelayLook,
+    look: DelayComparison,
     depth: NDArray[np.uint16],
     captured_s: float,
     joints_at: Callable[[float], NDArray[np.float64] | None],

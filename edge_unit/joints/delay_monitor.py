@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_unit.joints.delay_estimation import DELAYS_S, MOTION_SPAN_S, DelayEstimate, DelayLook, estimate_delay
+from edge_unit.joints.delay_estimation import DELAYS_S, MOTION_SPAN_S, DelayComparison, DelayEstimate, estimate_delay
 from edge_unit.joints.history import EXTRAPOLATION_MAX_S, JointHistory
 from edge_unit.pipeline import DepthPipeline
 from shared.clock import NS_PER_S
@@ -38,7 +38,7 @@ _HALF_SPAN_NS = round(0.5 * MOTION_SPAN_S * NS_PER_S)
 class _Looks:
     """The looks at frames before one and the same background: what a thread works on, and nothing else."""
 
-    def __init__(self, look: DelayLook) -> None:
+    def __init__(self, look: DelayComparison) -> None:
         self.look = look
         self.estimate: DelayEstimate | None = None
         self._misfits: deque[NDArray[np.float64]] = deque(maxlen=LOOKS_MAX)
@@ -53,10 +53,10 @@ class _Looks:
             self.estimate = None
 
 
-class DelayWatch:
+class DelayMonitor:
     """Gathers looks at one camera's frames. Times are by the master's clock.
 
-    All is for one thread, except for what `next_look` returns: that may run in any other at the same time.
+    All is for one thread, except for what `next_comparison` returns: that may run in any other at the same time.
     """
 
     def __init__(self) -> None:
@@ -78,7 +78,7 @@ class DelayWatch:
         made_for = pipeline, robot, pipeline.static_version
         if self._looks is None or made_for != self._made_for:
             self._looks = _Looks(
-                DelayLook(
+                DelayComparison(
                     pipeline.intrinsics,
                     pipeline.T_world_camera,
                     robot,
@@ -90,7 +90,7 @@ class DelayWatch:
         self._kept = at_ns, self._looks.look.thinned(depth)
         self._due_ns = at_ns + PERIOD_NS
 
-    def next_look(self, history: JointHistory) -> Callable[[], None] | None:
+    def next_comparison(self, history: JointHistory) -> Callable[[], None] | None:
         """The look at the kept frame, to be called once; it touches neither the pipeline nor `history`.
 
         None while joints from after the frame are not known, when none is kept or the robot did not move, and while

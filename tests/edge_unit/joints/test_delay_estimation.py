@@ -14,7 +14,15 @@ import yaml
 from numpy.typing import NDArray
 
 from edge_unit.__main__ import main
-from edge_unit.joints import DelayEstimate, DelayLook, DelayWatch, JointHistory, delay_monitor, estimate_delay, look_at
+from edge_unit.joints import (
+    DelayComparison,
+    DelayEstimate,
+    DelayMonitor,
+    JointHistory,
+    delay_monitor,
+    estimate_delay,
+    look_at,
+)
 from edge_unit.joints.delay_estimation import LOOKS_MIN
 from edge_unit.joints.delay_from_recording import JointSamples
 from edge_unit.joints.delay_monitor import PERIOD_NS
@@ -58,7 +66,7 @@ def looks(
 ) -> list[NDArray[np.float64]]:
     robot = pipeline.cell.robot
     assert robot is not None
-    look = DelayLook(INTRINSICS, POSE, robot, pipeline.expected_depth(None), FilterSettings())
+    look = DelayComparison(INTRINSICS, POSE, robot, pipeline.expected_depth(None), FilterSettings())
     found = [look_at(look, depth, t_s, lambda at_s: path.joints_at(at_s - delay_s)) for depth, t_s in frames]
     return [misfits for misfits in found if misfits is not None]
 
@@ -84,7 +92,7 @@ def test_a_delay_beyond_what_is_tried_is_refused(pipeline: DepthPipeline, frames
 
 def test_a_running_unit_warns_of_a_delay_that_is_off(pipeline: DepthPipeline, frames: list[Frame]) -> None:
     """Joints come 60 ms late, without times; frames are kept until those are known."""
-    watch, history = DelayWatch(), JointHistory()
+    watch, history = DelayMonitor(), JointHistory()
     began_ns, told = 100 * NS_PER_S, []
     # Slower than the frames were taken, so that each is due.
     slow = PERIOD_NS / NS_PER_S / PERIOD_S
@@ -94,12 +102,12 @@ def test_a_running_unit_warns_of_a_delay_that_is_off(pipeline: DepthPipeline, fr
         assert watch.due(at_ns)
         watch.keep(pipeline, depth, at_ns)
         assert not watch.due(at_ns + PERIOD_NS // 2)
-        assert watch.next_look(history) is None
+        assert watch.next_comparison(history) is None
         for step in range(round(PERIOD_NS / NS_PER_S / 0.008)):
             t_s = frame_s * slow + 0.008 * step - 0.1
             late_ns = began_ns + round((t_s + 0.06) * NS_PER_S)
             history.add([JointSample(late_ns, tuple(path.joints_at(t_s).tolist()), None)])
-        look = watch.next_look(history)
+        look = watch.next_comparison(history)
         if look is not None:
             look()
         told.append(watch.warning(0.0))
@@ -118,7 +126,7 @@ def test_looks_come_one_by_one_and_those_of_another_background_do_not_count(
 ) -> None:
     pipeline = DepthPipeline(INTRINSICS, POSE, world.cell)
     monkeypatch.setattr(delay_monitor, "estimate_delay", lambda misfits: DelayEstimate(1.0, 0.0, len(misfits)))
-    watch, history = DelayWatch(), JointHistory()
+    watch, history = DelayMonitor(), JointHistory()
     depth, frame_s = frames[3]
     for step in range(150):
         t_s = frame_s - 0.2 + 0.008 * step
@@ -126,22 +134,22 @@ def test_looks_come_one_by_one_and_those_of_another_background_do_not_count(
 
     def kept_look() -> Callable[[], None] | None:
         watch.keep(pipeline, depth, NS_PER_S + round(frame_s * NS_PER_S))
-        return watch.next_look(history)
+        return watch.next_comparison(history)
 
     first = kept_look()
     assert first is not None
-    assert watch.next_look(history) is None
+    assert watch.next_comparison(history) is None
     # Until it is done there is no other, and a frame that is kept meanwhile waits for it.
     assert kept_look() is None
     first()
     assert watch.warning(0.0) is not None
-    second = watch.next_look(history)
+    second = watch.next_comparison(history)
     assert second is not None
     pipeline.move(camera_at((0.9, 0.1, 1.2), (0.25, 0.0, 0.2)))
     watch.keep(pipeline, depth, NS_PER_S + round(frame_s * NS_PER_S))
     second()
     assert watch.warning(0.0) is None
-    third = watch.next_look(history)
+    third = watch.next_comparison(history)
     assert third is not None
     third()
     assert watch.warning(0.0) is not None
@@ -153,7 +161,7 @@ def test_a_frame_that_is_kept_is_a_copy(pipeline: DepthPipeline, frames: list[Fr
     robot = pipeline.cell.robot
     assert robot is not None
     static_m = pipeline.expected_depth(None)
-    look = DelayLook(INTRINSICS, POSE, robot, static_m, FilterSettings())
+    look = DelayComparison(INTRINSICS, POSE, robot, static_m, FilterSettings())
     joints = [PATH.joints_at(frame_s)]
     before = depth.copy()
     thinned_m = look.thinned(before)

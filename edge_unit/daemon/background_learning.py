@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edge_unit.daemon.background_store import BackgroundStore, Place
 from edge_unit.joints import JointEstimate
-from edge_unit.pipeline import DepthPipeline, ReferenceLearner
+from edge_unit.pipeline import BackgroundLearner, DepthPipeline
 from edge_unit.uplink.assignment import Trouble
 from shared.messages import DONE, Command, Outcome, Progress
 
@@ -28,7 +28,7 @@ POSE_CHANGED = "the camera's pose changed meanwhile"
 class _Lesson:
     """A background that is being learned."""
 
-    learner: ReferenceLearner
+    learner: BackgroundLearner
     frames: int
     command: Command | None
 

@@ -59,7 +59,7 @@ class BackgroundStore:
         self._images = folder / "background.npz"
         self._label = StateFile(folder / "background.json")
 
-    def load(self, place: Place) -> Reference | None:
+    def load(self, place: Place) -> BackgroundModel | None:
         """The background of this place, or None when there is none, or another's, or a damaged one."""
         label = self._label.load(dict)
         if label is None:
@@ -71,12 +71,12 @@ class BackgroundStore:
             if _sha256(self._images) != label.get("sha256"):
                 logger.warning("the background in %s is damaged", self._images)
                 return None
-            return Reference.load(self._images)
+            return BackgroundModel.load(self._images)
         except (OSError, InputError) as error:
             logger.warning("the background cannot be used: %s", error)
             return None
 
-    def save(self, place: Place, reference: Reference) -> None:
+    def save(self, place: Place, reference: BackgroundModel) -> None:
         """Keep a background; the label is written last and names the images, so that half of it counts for nothing."""
         try:
             self._images.parent.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,7 @@ In the order of the flow:
     images            what a unit sees, as PNG
 """
 
-from edge_unit.pipeline.background_model import Reference, ReferenceLearner
+from edge_unit.pipeline.background_model import BackgroundLearner, BackgroundModel
 from edge_unit.pipeline.depth_pipeline import DepthPipeline
 from edge_unit.pipeline.expected_depth import BareRobot
 from edge_unit.pipeline.frame_result import FrameResult
@@ -35,8 +35,8 @@ __all__ = [
     "DepthPipeline",
     "FrameResult",
     "Misfit",
-    "Reference",
-    "ReferenceLearner",
+    "BackgroundModel",
+    "BackgroundLearner",
     "Refiner",
     "SeenBlocks",
     "StageTimes",

@@ -55,7 +55,7 @@ FILE_BYTES_MAX = 64 * 1024 * 1024
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class BackgroundModel:
     """What the empty cell shows: `depth_m` and `spread_m` (H, W) float32 in metres, NaN where nothing was learned.
 
     It belongs to one camera at one place: it is void when the camera moved, or its serial or profile changed.
@@ -90,7 +90,7 @@ class Reference:
         return buffer.getvalue()
 
     @classmethod
-    def from_bytes(cls, data: bytes) -> Reference:
+    def from_bytes(cls, data: bytes) -> BackgroundModel:
         """Inverse of `to_bytes`.
 
         Raises:
@@ -112,7 +112,7 @@ class Reference:
         write_whole(path, self.to_bytes())
 
     @classmethod
-    def load(cls, path: Path) -> Reference:
+    def load(cls, path: Path) -> BackgroundModel:
         """Read what `save` wrote.
 
         Raises:
@@ -128,7 +128,7 @@ class Reference:
             raise InputError(f"{path}: {error}") from error
 
 
-class ReferenceLearner:
+class BackgroundLearner:
     """Collects frames of the empty cell, any number, in memory that does not grow."""
 
     def __init__(self, intrinsics: Intrinsics, noise_per_m: float, range_max_m: float) -> None:
@@ -165,7 +165,7 @@ class ReferenceLearner:
         kernels.observe(depth_raw, robot_near_raw, robot_span_raw, self._matching, self._modes)
         self.frames += 1
 
-    def reference(self) -> Reference:
+    def reference(self) -> BackgroundModel:
         """What was learned so far.
 
         Raises:
@@ -177,4 +177,4 @@ class ReferenceLearner:
         spread_m = np.empty(self._intrinsics.shape, np.float32)
         prior = plain(kernels.Prior(SHARE_MIN, PRIOR_FRAMES, self._noise_per_m))
         kernels.conclude(self._modes, prior, depth_m, spread_m)
-        return Reference(depth_m, spread_m, self.frames)
+        return BackgroundModel(depth_m, spread_m, self.frames)

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edge_unit.pipeline.background_model import Reference, ReferenceLearner
+from edge_unit.pipeline.background_model import BackgroundLearner, BackgroundModel
 from edge_unit.pipeline.fit_check import HealthCheck
 from edge_unit.pipeline.frame_result import FrameResult
 from edge_unit.pipeline.moving_model import EXACT, MovingModel
@@ -125,7 +125,7 @@ class DepthPipeline:
 
     # ------------------------------------------------------------------ learning the empty cell
 
-    def learn(self, frames: Iterable[tuple[NDArray[np.uint16], ArrayLike | None]]) -> Reference:
+    def learn(self, frames: Iterable[tuple[NDArray[np.uint16], ArrayLike | None]]) -> BackgroundModel:
         """Learn the static layer from frames of the empty cell; `use` makes it count.
 
         Args:
@@ -143,33 +143,33 @@ class DepthPipeline:
             self.learn_frame(learner, *pair)
         return learner.reference()
 
-    def learner(self) -> ReferenceLearner:
+    def learner(self) -> BackgroundLearner:
         """Return a learner for this camera, to be fed with `learn_frame`."""
-        return ReferenceLearner(self.intrinsics, self._noise_per_m, self.settings.range_max_m)
+        return BackgroundLearner(self.intrinsics, self._noise_per_m, self.settings.range_max_m)
 
-    def learn_frame(self, learner: ReferenceLearner, depth: NDArray[np.uint16], joints: ArrayLike | None) -> None:
+    def learn_frame(self, learner: BackgroundLearner, depth: NDArray[np.uint16], joints: ArrayLike | None) -> None:
         """Add one frame of the empty cell to `learner`; arguments and errors as in `learn`.
 
         The robot is left out by its own padded render, but for the links that never move: they belong to what stands
         still, and leaving them out would leave an unlearned ring around the base.
         """
-        _of_type(learner, ReferenceLearner, "learner")
+        _of_type(learner, BackgroundLearner, "learner")
         depth_raw = self.intrinsics.check_depth(depth)
         if self.cell.robot is not None and joints is None:
             raise InputError("learn: expected joints with every frame, for the robot must not be learned as background")
         robot = self._moving.place(joints, without_fixed_links=True)
         learner.add(depth_raw, robot.near_raw, robot.span_raw)
 
-    def use(self, reference: Reference | None) -> None:
+    def use(self, reference: BackgroundModel | None) -> None:
         """Make `reference` part of the static layer from now on; None takes it out.
 
         Raises:
             InputError: it is no reference, or was learned by a camera of another resolution; the old one stays.
         """
-        self._static.use(None if reference is None else _of_type(reference, Reference, "reference"))
+        self._static.use(None if reference is None else _of_type(reference, BackgroundModel, "reference"))
 
     @property
-    def reference(self) -> Reference | None:
+    def reference(self) -> BackgroundModel | None:
         """The background model in use."""
         return self._static.reference
 

@@ -96,7 +96,7 @@ class StaticModel:
         self._room_raw = np.empty(intrinsics.shape, np.uint16)
         self._scratch_raw = np.empty((2, *intrinsics.shape), np.uint16)
         self.bodies = bodies
-        self.reference: Reference | None = None
+        self.reference: BackgroundModel | None = None
         self.halo = EdgeHalo(intrinsics)
         self.version = 0
         self.images = self._renewed()
@@ -106,7 +106,7 @@ class StaticModel:
         self.bodies, self._settings = bodies, settings
         self.images = self._renewed()
 
-    def use(self, reference: Reference | None) -> None:
+    def use(self, reference: BackgroundModel | None) -> None:
         """Make `reference` part of the model; None takes it out.
 
         Raises:

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import edge_unit.pipeline.background_model
-from edge_unit.pipeline import DepthPipeline, Reference, ReferenceLearner
+from edge_unit.pipeline import BackgroundLearner, BackgroundModel, DepthPipeline
 from shared.cell import Cell, PlacedMesh
 from shared.errors import InputError
 from shared.meshes import box_mesh, cylinder_mesh
@@ -196,7 +196,7 @@ def test_it_outlives_new_settings_and_a_new_cell() -> None:
 
 
 def test_one_of_another_resolution_is_refused() -> None:
-    other = Reference(np.ones((3, 4), np.float32), np.ones((3, 4), np.float32), 1)
+    other = BackgroundModel(np.ones((3, 4), np.float32), np.ones((3, 4), np.float32), 1)
     empty = pipeline(robot=False)
     with pytest.raises(InputError, match=r"\(90, 160\).*\(3, 4\)"):
         empty.use(other)
@@ -206,17 +206,17 @@ def test_one_of_another_resolution_is_refused() -> None:
 # ---------------------------------------------------------------- bytes
 
 
-def some_reference() -> Reference:
+def some_reference() -> BackgroundModel:
     rng = np.random.default_rng(0)
     depth_m = rng.uniform(0.5, 4.0, (24, 42)).astype(np.float32)
     depth_m[rng.random(depth_m.shape) < 0.2] = np.nan
-    return Reference(depth_m, rng.uniform(0.0, 0.1, depth_m.shape).astype(np.float32), 17)
+    return BackgroundModel(depth_m, rng.uniform(0.0, 0.1, depth_m.shape).astype(np.float32), 17)
 
 
 def test_save_and_load(tmp_path: Path) -> None:
     reference = some_reference()
     reference.save(tmp_path / "empty.npz")
-    loaded = Reference.load(tmp_path / "empty.npz")
+    loaded = BackgroundModel.load(tmp_path / "empty.npz")
     assert np.array_equal(loaded.depth_m, reference.depth_m, equal_nan=True)
     assert np.array_equal(loaded.spread_m, reference.spread_m)
     assert loaded.frames == 17
@@ -229,14 +229,14 @@ def test_a_file_that_is_no_reference_is_one_error_that_names_it(tmp_path: Path, 
     if content is not None:
         file.write_bytes(content)
     with pytest.raises(InputError, match=r"empty\.npz"):
-        Reference.load(file)
+        BackgroundModel.load(file)
 
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(edge_unit.pipeline.background_model, "FILE_BYTES_MAX", 100)
     some_reference().save(tmp_path / "empty.npz")
     with pytest.raises(InputError, match="at most 100 bytes"):
-        Reference.load(tmp_path / "empty.npz")
+        BackgroundModel.load(tmp_path / "empty.npz")
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -249,7 +249,7 @@ def test_damaged_bytes_are_an_input_error_or_nothing() -> None:
         for place in rng.integers(0, max(len(damaged), 1), rng.integers(1, 4)):
             damaged[place : place + 1] = bytes([rng.integers(256)])
         try:
-            Reference.from_bytes(bytes(damaged))
+            BackgroundModel.from_bytes(bytes(damaged))
         except InputError:
             refused += 1
     assert refused > 2500
@@ -286,14 +286,14 @@ def images(depth_m: float, spread_m: float = 0.01) -> dict[str, NDArray[np.float
 def test_contents_that_make_no_sense_are_refused(arrays: dict[str, Any]) -> None:
     """A depth below 0, say, would hide the whole cell."""
     with pytest.raises(InputError, match="reference: expected"):
-        Reference.from_bytes(npz(**arrays))
+        BackgroundModel.from_bytes(npz(**arrays))
 
 
 def test_bytes_of_a_single_array_are_refused() -> None:
     buffer = io.BytesIO()
     np.save(buffer, np.ones(3))
     with pytest.raises(InputError, match="reference: expected"):
-        Reference.from_bytes(buffer.getvalue())
+        BackgroundModel.from_bytes(buffer.getvalue())
 
 
 # ---------------------------------------------------------------- the learner
@@ -301,7 +301,7 @@ def test_bytes_of_a_single_array_are_refused() -> None:
 
 def test_a_learner_takes_no_more_frames_than_it_can_count(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(edge_unit.pipeline.background_model, "MAX_FRAMES", 2)
-    learner = ReferenceLearner(CAMERA, 0.01, 10.0)
+    learner = BackgroundLearner(CAMERA, 0.01, 10.0)
     for _ in range(2):
         learner.add(look(), *NO_ROBOT)
     with pytest.raises(InputError, match="at most 2 frames"):
@@ -311,7 +311,7 @@ def test_a_learner_takes_no_more_frames_than_it_can_count(monkeypatch: pytest.Mo
 
 def test_a_learner_without_frames_has_no_reference() -> None:
     with pytest.raises(InputError, match="at least one frame"):
-        ReferenceLearner(CAMERA, 0.01, 10.0).reference()
+        BackgroundLearner(CAMERA, 0.01, 10.0).reference()
 
 
 def test_a_robot_without_moving_links_is_learned_with_the_rest() -> None:

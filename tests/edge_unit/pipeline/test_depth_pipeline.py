@@ -592,7 +592,7 @@ def test_a_pipeline_of_other_things_is_one_clear_error(name: str, value: Any, me
 @pytest.mark.parametrize(
     ("call", "value", "message"),
     [
-        ("use", "x", "reference: expected Reference, got str"),
+        ("use", "x", "reference: expected BackgroundModel, got str"),
         ("learn", [1], "frames: expected pairs of depth and joints, got int"),
         ("learn", [(GOOD,)], "frames: expected pairs of depth and joints, got 1 values"),
         ("learn", None, "frames: expected Iterable, got NoneType"),

@@ -29,7 +29,7 @@ from edge_unit.daemon.report import troubled
 from edge_unit.daemon.task_group import TaskGroup
 from edge_unit.daemon.unit_status import UnitStatus
 from edge_unit.daemon.warm_up import rehearse
-from edge_unit.monitoring import CameraStatus, PoseMonitor, Progress, Stages, Trace, boot_id
+from edge_unit.monitoring import CameraStatus, PoseMonitor, Stages, StallDetector, Trace, boot_id
 from edge_unit.source_factory import is_recording
 from edge_unit.sources.frame import DepthFrame, DepthSource
 from edge_unit.sources.status import ReportsStatus
@@ -92,7 +92,7 @@ class Unit:
         self._work = self._frame_work()
         self._errands = TaskGroup()
         self._showing = ImageRequests(self.uplink, self._work.assigned, self._errands)
-        self._progress = Progress()
+        self._progress = StallDetector()
         self._rehearsal: asyncio.Task[None] | None = None
         self._limiter = FrameLimiter(config.fps_max)
         self._status = UnitStatus(monotonic_ns())

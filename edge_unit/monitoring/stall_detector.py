@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from shared.clock import NS_PER_S, monotonic_ns
 
 
-class Progress:
+class StallDetector:
     """Work that is under way, each piece with its limit."""
 
     def __init__(self) -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import pytest
 
-from edge_unit.monitoring import Progress
+from edge_unit.monitoring import StallDetector
 from shared.clock import NS_PER_S, monotonic_ns
 
 
 def test_only_work_beyond_its_limit_is_stuck() -> None:
-    progress = Progress()
+    progress = StallDetector()
     assert progress.stuck(monotonic_ns() + 3600 * NS_PER_S) is None
     with progress.working("compiling", 240.0), progress.working("frame 7", 5.0):
         now_ns = monotonic_ns()
@@ -20,7 +20,7 @@ def test_only_work_beyond_its_limit_is_stuck() -> None:
 
 
 def test_work_that_fails_has_come_to_its_end() -> None:
-    progress = Progress()
+    progress = StallDetector()
     with pytest.raises(ValueError, match="no"), progress.working("frame 7", 5.0):
         raise ValueError("no")
     assert progress.stuck(monotonic_ns() + 3600 * NS_PER_S) is None

@@ -14,7 +14,7 @@ from edge_unit.daemon.pipeline_manager import AssignedPipeline
 from edge_unit.daemon.refinement_task import RefinementTask
 from edge_unit.daemon.report import health_of, parts_of, troubled, within_bounds
 from edge_unit.joints import JointEstimate
-from edge_unit.monitoring import PoseMonitor, Stages
+from edge_unit.monitoring import PoseMonitor, StageTimer
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.sources.frame import DepthFrame
 from edge_unit.uplink.assignment import Assignment, Report, Trouble
@@ -59,7 +59,7 @@ class FrameProcessor:
         frame: DepthFrame,
         joints: JointEstimate | None,
         changes: Iterable[Command],
-        stages: Stages,
+        stages: StageTimer,
     ) -> Report:
         """What `frame` shows with all that was assigned and asked for; what cannot be done is the report's trouble."""
         try:
@@ -101,7 +101,7 @@ class FrameProcessor:
         assignment: Assignment,
         frame: DepthFrame,
         joints: JointEstimate | None,
-        stages: Stages,
+        stages: StageTimer,
     ) -> Report:
         """What a frame shows, and whether its camera can be trusted."""
         stages.end("thread")

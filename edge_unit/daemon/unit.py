@@ -29,7 +29,7 @@ from edge_unit.daemon.report import troubled
 from edge_unit.daemon.task_group import TaskGroup
 from edge_unit.daemon.unit_status import UnitStatus
 from edge_unit.daemon.warm_up import rehearse
-from edge_unit.monitoring import CameraStatus, PoseMonitor, Stages, StallDetector, Trace, boot_id
+from edge_unit.monitoring import CameraStatus, PoseMonitor, StageTimer, StallDetector, Trace, boot_id
 from edge_unit.source_factory import is_recording
 from edge_unit.sources.frame import DepthFrame, DepthSource
 from edge_unit.sources.status import ReportsStatus
@@ -236,7 +236,7 @@ class Unit:
         self, assignment: Assignment, T_world_camera: Transform, frame: DepthFrame, orders: CommandBatch
     ) -> None:
         """Process the frame and offer the result; nothing that follows delays it."""
-        stages = Stages(frame.captured_at_ns)
+        stages = StageTimer(frame.captured_at_ns)
         stages.end("source")
         joints = await self._work.joints.at(assignment, frame)
         stages.end("joints")

@@ -15,14 +15,14 @@ In the order of the flow:
 from edge_unit.monitoring.camera_status import CameraStatus
 from edge_unit.monitoring.host import boot_id, clock_is_set, usb_cameras
 from edge_unit.monitoring.pose_monitor import PoseMonitor, Verdict, place_of
-from edge_unit.monitoring.stage_timer import Stages
+from edge_unit.monitoring.stage_timer import StageTimer
 from edge_unit.monitoring.stall_detector import StallDetector
 from edge_unit.monitoring.trace import Trace, TraceRecord, read_trace
 
 __all__ = [
     "CameraStatus",
     "StallDetector",
-    "Stages",
+    "StageTimer",
     "PoseMonitor",
     "Trace",
     "TraceRecord",

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from shared.clock import monotonic_ns
 
 
-class Stages:
+class StageTimer:
     """Nanoseconds by stage, in the order of the flow; together they are the frame's age when the last one ended."""
 
     def __init__(self, captured_at_ns: int) -> None:

@@ -26,7 +26,7 @@ REFINE_FRAMES = 30
 
 
 @dataclass(frozen=True, eq=False)
-class Gathered:
+class RefinementFrames:
     """Frames for the pose to be refined by."""
 
     command: Command
@@ -41,13 +41,13 @@ class RefinementTask:
         self._uplink = uplink
         self._assigned = assigned
         self._stance = stance
-        self._gathered: Gathered | None = None
+        self._gathered: RefinementFrames | None = None
 
     def begin(self, pipeline: DepthPipeline, command: Command) -> None:
         """Gather frames from now on, as `command` asks."""
         if self._gathered is not None:
             self._uplink.finish(self._gathered.command, Outcome("superseded", "it was asked to begin anew"))
-        self._gathered = Gathered(command, [], pipeline.refiner())
+        self._gathered = RefinementFrames(command, [], pipeline.refiner())
 
     def gather(self, pipeline: DepthPipeline, depth: NDArray[np.uint16], joints: JointEstimate | None) -> None:
         """Keep a frame (H, W) without the robot, when the pose is to be refined."""
@@ -59,7 +59,7 @@ class RefinementTask:
             return
         gathered.frames.append(pipeline.without_robot(depth, None if joints is None else joints.positions))
 
-    def take(self) -> Gathered | None:
+    def take(self) -> RefinementFrames | None:
         """The frames, once there are enough: then they are no longer kept."""
         gathered = self._gathered
         if gathered is None or len(gathered.frames) < REFINE_FRAMES:
@@ -67,7 +67,7 @@ class RefinementTask:
         self._gathered = None
         return gathered
 
-    async def refine(self, gathered: Gathered) -> None:
+    async def refine(self, gathered: RefinementFrames) -> None:
         """Refine the pose by the frames gathered, while others are processed, and tell the master."""
         try:
             found = await asyncio.to_thread(gathered.refiner.refine, gathered.frames)

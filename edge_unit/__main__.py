@@ -131,10 +131,10 @@ def _compile_kernels(options: argparse.Namespace) -> int:
     if target is None or target.machine != platform.machine():
         raise ConfigError(f"--target: kernels are compiled on {platform.machine()} for {platform.machine()} only")
     folder = settle_for(target, options.folder)
-    from edge_unit.daemon.warm_up import warm_up
+    from edge_unit.daemon.warm_up import warm_up_kernels
     from geometry.rendering.hull_store import FOLDER as HULLS
 
-    warm_up()
+    warm_up_kernels()
     if options.config is not None:
         source = load(UnitConfig, options.config, os.environ, ENVIRONMENT_PREFIX, {}).source
         if isinstance(source, SimulatedSourceConfig):

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_unit.pipeline import Reference
+from edge_unit.pipeline import BackgroundModel
 from edge_unit.sources.frame import CameraInfo
 from shared.errors import InputError
 from shared.files import StateFile

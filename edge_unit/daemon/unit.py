@@ -28,7 +28,7 @@ from edge_unit.daemon.refinement_task import RefinementTask
 from edge_unit.daemon.report import troubled
 from edge_unit.daemon.task_group import TaskGroup
 from edge_unit.daemon.unit_status import UnitStatus
-from edge_unit.daemon.warm_up import warm_up
+from edge_unit.daemon.warm_up import warm_up_kernels
 from edge_unit.monitoring import CameraStatus, PoseMonitor, StageTimer, StallDetector, Trace, boot_id
 from edge_unit.source_factory import is_recording
 from edge_unit.sources.frame import DepthFrame, DepthSource
@@ -188,7 +188,7 @@ class Unit:
 
     def _rehearse(self) -> None:
         with self._progress.working("compiling the kernels", PREPARE_S_MAX):
-            warm_up()
+            warm_up_kernels()
 
     async def _end(self) -> None:
         """A recording has no more frames."""

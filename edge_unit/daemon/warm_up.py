@@ -21,7 +21,7 @@ CAMERA = Intrinsics(64, 48, 60.0, 60.0, 31.5, 23.5)
 DEPTH_MM = 1000
 
 
-def warm_up() -> None:
+def warm_up_kernels() -> None:
     """Run the pipeline once before a cell that has a wall and a robot, whatever the true one has."""
     wall = PlacedMesh("wall", box_mesh("wall", (2.0, 2.0, 0.1)), from_xyz_rpy((0.0, 0.0, 3.0), np.zeros(3)))
     robot = Robot.from_dh(

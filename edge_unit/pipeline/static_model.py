@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_unit.pipeline.background_model import Reference
+from edge_unit.pipeline.background_model import BackgroundModel
 from edge_unit.pipeline.edge_halo import EdgeHalo
 from edge_unit.pipeline.expected_depth import StaticLayer
 from geometry.kernels import limits

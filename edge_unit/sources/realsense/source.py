@@ -87,7 +87,7 @@ class RealsenseSourceConfig(BaseModel):
         )
 
 
-class Look:
+class RealsenseImages:
     """Pictures of one image stream, while depth pauses."""
 
     def __init__(self, info: ImageInfo, supervisor: CaptureSupervisor) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_unit.daemon.background_store import BackgroundStore, Place
-from edge_unit.pipeline import Reference
+from edge_unit.pipeline import BackgroundModel
 from edge_unit.sources.frame import CameraInfo
 from shared.camera import Intrinsics
 from shared.transforms import from_xyz_rpy

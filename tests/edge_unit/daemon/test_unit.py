@@ -27,7 +27,7 @@ from edge_unit.daemon.frame_processor import FrameProcessor
 from edge_unit.daemon.joint_lookup import FrameJoints
 from edge_unit.daemon.refinement_task import REFINE_FRAMES
 from edge_unit.daemon.unit import Unit
-from edge_unit.daemon.warm_up import warm_up
+from edge_unit.daemon.warm_up import warm_up_kernels
 from edge_unit.monitoring import read_trace
 from edge_unit.sources.frame import CameraInfo, DepthFrame
 from edge_unit.sources.image import ImageFrame, ImageInfo, ImageStream
@@ -73,7 +73,7 @@ def patch(depth_mm: int, column: int = 24) -> NDArray[np.uint16]:
 @pytest.fixture(scope="module", autouse=True)
 def compiled() -> None:
     """In a checkout that is new, kernels are compiled here and not while a test counts seconds."""
-    warm_up()
+    warm_up_kernels()
 
 
 class FakeSource:

@@ -11,7 +11,7 @@ import sys
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from edge_unit.daemon.warm_up import warm_up
+from edge_unit.daemon.warm_up import warm_up_kernels
 from edge_unit.pipeline import DepthPipeline
 from geometry import kernels
 from shared.transforms import look_at
@@ -43,12 +43,12 @@ def test_the_first_frame_needs_no_kernel_that_was_not_rehearsed() -> None:
 
 def test_no_reader_of_meshes_is_imported_for_it() -> None:
     # Half a second, which would be half of a start.
-    code = "import sys; from edge_unit.daemon.warm_up import warm_up; warm_up(); sys.exit('trimesh' in sys.modules)"
+    code = "import sys; from edge_unit.daemon.warm_up import warm_up_kernels; warm_up_kernels(); sys.exit('trimesh' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=110)
 
 
 if __name__ == "__main__":
-    warm_up()
+    warm_up_kernels()
     ready = compiled()
     assert sum(count > 0 for count in ready.values()) > 10, ready
     first_frame()

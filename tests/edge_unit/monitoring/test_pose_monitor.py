@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from edge_unit.monitoring import PoseMonitor, Verdict, place_of
-from edge_unit.monitoring.pose_monitor import BASELINE_LOOKS, FILE_NAME, PERIOD_S, WINDOW
+from edge_unit.monitoring.pose_monitor import BASELINE_LOOKS, FILE_NAME, OLD_FILE_NAME, PERIOD_S, WINDOW
 from edge_unit.pipeline import DepthPipeline, Misfit
 from shared.transforms import Transform, from_xyz_rpy
 from simulation.cameras.camera import SimulatedCamera, d435i_intrinsics, rig
@@ -141,7 +141,21 @@ def test_a_damaged_file_is_passed_over(watched: Watched, text: str) -> None:
     assert set(watched.looks(BASELINE_LOOKS)) == {Verdict()}
 
 
-def test_without_known_surfaces_nothing_is_told(watched: Watched) -> None:
+def test_the_file_of_former_versions_is_read(watched: Watched) -> None:
+    usual = watched.stance._usual
+    assert usual is not None
+    (watched.folder / FILE_NAME).rename(watched.folder / OLD_FILE_NAME)
+    watched.restart()
+    assert watched.stance._usual is not None
+    assert watched.stance._usual.slope == pytest.approx(usual.slope)
+    watched.last(2 * BASELINE_LOOKS)
+    assert (watched.folder / FILE_NAME).exists()
+    (watched.folder / OLD_FILE_NAME).write_text("{}")
+    watched.restart()
+    assert watched.stance._usual is not None
+
+
+def test_without_known_surfaces_there_is_no_verdict(watched: Watched) -> None:
     watched.stance.judge(misfit_of(watched), 99, 0)
     bare = replace(misfit_of(watched), static_share=0.0, slope=np.full(6, 0.5))
     verdicts = {watched.stance.judge(bare, 99, n) for n in range(WINDOW)}

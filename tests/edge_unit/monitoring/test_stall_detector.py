@@ -15,7 +15,7 @@ def test_only_work_beyond_its_limit_is_stuck() -> None:
     with progress.working("compiling", 240.0), progress.working("frame 7", 5.0):
         now_ns = monotonic_ns()
         assert progress.stuck(now_ns) is None
-        assert progress.stuck(now_ns + 6 * NS_PER_S) == ("frame 7 has not come to its end for 6 s, expected within 5 s")
+        assert progress.stuck(now_ns + 6 * NS_PER_S) == ("frame 7 has not finished for 6 s, expected within 5 s")
     assert progress.stuck(monotonic_ns() + 3600 * NS_PER_S) is None
 
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the robots were at a frame's time.
+"""The robots' joints at a frame's time.
 
 In the order of the flow:
 
     history               the last seconds of joints, interpolated to a frame's time
-    delay_estimation      how much later the joints' times are than the frames'
-    delay_from_recording  the same by a recording
-    delay_monitor         the same while a unit runs, as a warning
+        delay_estimation      the delay of the joints' times against the frames' times
+        delay_from_recording  the same from a recording
+        delay_monitor         the same while a unit runs, as a warning
 """
 
 from edge_unit.joints.delay_estimation import DelayComparison, DelayEstimate, estimate_delay, look_at

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""While a unit runs: are the joints later than `joint_delay_s` says?
+"""The delay monitor: warns while a unit runs if the joints' delay differs from `joint_delay_s`.
 
-Now and then a frame is kept, a few thousand of its depths, until joints from well after it are known; then it is
-looked at, in a thread beside the frames. Nothing is changed by itself: the operator is told what to set.
+From time to time a few thousand depths of a frame are kept until joints from well after the frame are known. Then they
+are compared with the robot, in a background thread. The unit changes nothing itself: it tells the operator the value.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from shared.clock import NS_PER_S
 from shared.errors import InputError
 
 PERIOD_NS = NS_PER_S // 2
-"""Between two looks, each of which takes a core for the time of a few frames."""
+"""Time between two comparisons; each takes a core for the time of a few frames."""
 
 LOOKS_MAX = 96
-"""The last three quarters of a minute in which the robot moved."""
+"""Three quarters of a minute of motion."""
 
 OFF_S = 0.015
 OFF_SIGMAS = 4.0
-"""Off by more than both is worth a warning: at 1 m/s it takes 15 of the 20 mm that the padding leaves for all but the
-camera's halo."""
+"""A delay that is off by more than both is worth a warning: at 1 m/s it takes 15 of the 20 mm that the padding leaves
+for all but the camera's halo."""
 
 _DELAYS_NS = np.rint(DELAYS_S * NS_PER_S).astype(np.int64)
 _HALF_SPAN_NS = round(0.5 * MOTION_SPAN_S * NS_PER_S)
 
 
 class _Looks:
-    """The looks at frames before one and the same background: what a thread works on, and nothing else."""
+    """Comparisons of frames with the same static surfaces: the data of the thread, and nothing else."""
 
     def __init__(self, look: DelayComparison) -> None:
         self.look = look
@@ -44,19 +44,19 @@ class _Looks:
         self._misfits: deque[NDArray[np.float64]] = deque(maxlen=LOOKS_MAX)
 
     def add(self, thinned_m: NDArray[np.float32], joints: list[NDArray[np.float64]]) -> None:
-        """Look at a frame; joints (n,) at each of the delays."""
+        """Compare a frame; joints (n,) at each of the delays."""
         self._misfits.append(self.look.misfits(thinned_m, joints))
         try:
             self.estimate = estimate_delay(self._misfits)
         except InputError:
-            # Too few as yet, or the camera does not see the robot: then there is nothing to tell.
+            # Too few frames yet, or the camera does not see the robot: then there is no estimate.
             self.estimate = None
 
 
 class DelayMonitor:
-    """Gathers looks at one camera's frames. Times are by the master's clock.
+    """Collects comparisons of one camera's frames. Times are by the master's clock.
 
-    All is for one thread, except for what `next_comparison` returns: that may run in any other at the same time.
+    Use it from one thread, except for the callables that `next_comparison` returns: they may run in another thread.
     """
 
     def __init__(self) -> None:
@@ -67,11 +67,11 @@ class DelayMonitor:
         self._looking = False
 
     def due(self, at_ns: int) -> bool:
-        """Whether the frame that was captured at `at_ns` should be kept; also after a clock that went back."""
+        """Return True if the frame captured at `at_ns` should be kept; also after a clock that went back."""
         return not self._due_ns - 2 * PERIOD_NS <= at_ns < self._due_ns
 
     def keep(self, pipeline: DepthPipeline, depth: NDArray[np.uint16], at_ns: int) -> None:
-        """Keep a copy of a frame (H, W) that is due; all begins anew when what is known besides the joints changed."""
+        """Keep a copy of a frame (H, W) that is due; after a change of the static surfaces or the robot, start anew."""
         robot = pipeline.cell.robot
         if robot is None:
             return
@@ -91,10 +91,10 @@ class DelayMonitor:
         self._due_ns = at_ns + PERIOD_NS
 
     def next_comparison(self, history: JointHistory) -> Callable[[], None] | None:
-        """The look at the kept frame, to be called once; it touches neither the pipeline nor `history`.
+        """Return the comparison of the kept frame, to be called once; it touches neither the pipeline nor `history`.
 
-        None while joints from after the frame are not known, when none is kept or the robot did not move, and while
-        the look before it is not done.
+        None while joints from after the frame are not known, no frame is kept, the robot did not move, or the previous
+        comparison is still running.
         """
         kept, looks = self._kept, self._looks
         if kept is None or looks is None or self._looking or history.newest_ns < kept[0] + int(_DELAYS_NS[-1]):
@@ -117,7 +117,7 @@ class DelayMonitor:
             self._looking = False
 
     def warning(self, joint_delay_s: float) -> str | None:
-        """What to set instead, where `joint_delay_s` is clearly off."""
+        """Return the value to set instead of `joint_delay_s` if that is clearly wrong, else None."""
         found = None if self._looks is None else self._looks.estimate
         if found is None:
             return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the master asked for, by when it is carried out."""
+"""Commands of the master, sorted by the time of their execution."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shared.messages import Command
 
 @dataclass(frozen=True)
 class CommandBatch:
-    """Commands: in place of a frame, before it is filtered, or afterwards with what it showed."""
+    """Commands that replace a frame, that run before it is filtered, or that need its result."""
 
     calibrations: list[Command] = field(default_factory=list)
     changes: list[Command] = field(default_factory=list)
@@ -20,7 +20,7 @@ class CommandBatch:
 
     @classmethod
     def take(cls, queue: asyncio.Queue[Command]) -> CommandBatch:
-        """All that wait."""
+        """Take all waiting commands."""
         orders = cls()
         while not queue.empty():
             command = queue.get_nowait()
@@ -34,6 +34,6 @@ class CommandBatch:
 
 
 def put_back(queue: asyncio.Queue[Command], commands: Iterable[Command]) -> None:
-    """Have `commands` wait for the next frame."""
+    """Put `commands` back, for the next frame."""
     for command in commands:
         queue.put_nowait(command)

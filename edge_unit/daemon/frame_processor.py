@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Everything about a frame that takes time, in a thread while the event loop talks to the master."""
+"""All slow work on a frame, in a thread, so that the event loop stays free for the master."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ logger = logging.getLogger(__name__)
 
 
 class FrameProcessor:
-    """From a frame to its report. Not for use from several threads at once.
+    """Makes a report from a frame. Not for use from several threads at once.
 
     Attributes:
         assigned: the pipeline as the master's latest assignment has it.
-        learning: the background model, and what is being learned.
-        joints: where the robot was at a frame's time.
+            learning: the background model, and the run that learns it.
+            joints: the robot's joints at a frame's time.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class FrameProcessor:
         stance: PoseMonitor,
         joints: FrameJoints,
     ) -> None:
-        """`finish` is told what became of a command."""
+        """`finish` receives the outcome of each command."""
         self._finish = finish
         self.assigned = assigned
         self.learning = learning
@@ -61,19 +61,19 @@ class FrameProcessor:
         changes: Iterable[Command],
         stages: StageTimer,
     ) -> Report:
-        """What `frame` shows with all that was assigned and asked for; what cannot be done is the report's trouble."""
+        """Carry out `changes` and make the report of `frame`; a failure is the report's trouble."""
         try:
             pipeline = self._prepare(assignment, T_world_camera, changes)
-            untold = self.learning.add(pipeline, self.assigned.place, frame.depth, joints)
-            if untold is not None:
-                return troubled(assignment, frame, untold)
+            pending = self.learning.add(pipeline, self.assigned.place, frame.depth, joints)
+            if pending is not None:
+                return troubled(assignment, frame, pending)
             return self._report(pipeline, assignment, frame, joints, stages)
         except InputError as error:
             logger.warning("frame %d: %s", frame.frame_number, error)
             return troubled(assignment, frame, Trouble("frame", str(error)))
 
     def _prepare(self, assignment: Assignment, T_world_camera: Transform, changes: Iterable[Command]) -> DepthPipeline:
-        """The pipeline as assignment and commands have it; without one, nothing can be changed."""
+        """Return the pipeline for the assignment after `changes`; without a pipeline no command can be carried out."""
         try:
             pipeline = self.assigned.prepare(assignment, T_world_camera)
         except InputError as error:
@@ -85,7 +85,7 @@ class FrameProcessor:
         return pipeline
 
     def _obey(self, command: Command, pipeline: DepthPipeline) -> None:
-        """Do what was asked; what takes more than one frame only begins here."""
+        """Carry out a command; one that needs several frames only starts here."""
         if command.verb == "learn_background":
             self.learning.begin(pipeline, command)
         elif command.verb == "drop_background":
@@ -93,7 +93,7 @@ class FrameProcessor:
         elif command.verb == "refine":
             self._refining.begin(pipeline, command)
         else:
-            self._finish(command, Outcome("refused", f"this unit does not know how to {command.verb}"))
+            self._finish(command, Outcome("refused", f"this unit does not know the command {command.verb}"))
 
     def _report(
         self,
@@ -103,7 +103,7 @@ class FrameProcessor:
         joints: JointEstimate | None,
         stages: StageTimer,
     ) -> Report:
-        """What a frame shows, and whether its camera can be trusted."""
+        """Filter a frame, and judge the health of its camera."""
         stages.end("thread")
         positions, uncertainty = known(joints)
         is_due = self._stance.due(frame.captured_at_ns)
@@ -121,7 +121,7 @@ class FrameProcessor:
     def afterwards(
         self, frame: DepthFrame, joints: JointEstimate | None, report: Report
     ) -> Iterator[Coroutine[Any, Any, None]]:
-        """Yield what is to be done beside the frames that follow one that was processed; for the event loop."""
+        """Yield the work that follows a processed frame, to run on the event loop beside the next frames."""
         pipeline = self.assigned.pipeline
         if pipeline is not None and joints is not None and report.health.trouble is None:
             look = self.joints.watch_delay(pipeline, frame)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures that people ask for: drawn between two frames, encoded and sent beside them."""
+"""The images that the master requests: drawn between two frames, encoded and sent in the background."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NO_POSE = "the pose of its camera is not known yet"
 
 
 class ImageRequests:
-    """One unit's pictures."""
+    """Image requests of one unit."""
 
     def __init__(self, uplink: Uplink, assigned: AssignedPipeline, tasks: TaskGroup) -> None:
         self._uplink = uplink
@@ -31,7 +31,7 @@ class ImageRequests:
         self._errands = tasks
 
     async def show(self, commands: Iterable[Command], frame: DepthFrame, joints: JointEstimate | None) -> None:
-        """Draw what `commands` ask for of the frame that was processed last."""
+        """Draw the images that `commands` request, from the frame that was processed last."""
         for command in commands:
             if command.image is None:
                 continue

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera's pose refined while a unit runs: frames are gathered, and the pose that they tell goes to the master."""
+"""Refinement of the camera's pose while a unit runs: gathers frames, refines, reports the pose to the master."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from shared.messages import Command, Outcome, PoseQuality
 logger = logging.getLogger(__name__)
 
 REFINE_FRAMES = 30
-"""Frames whose median a pose is refined by: two seconds at 15 fps, in which people pass by."""
+"""A pose is refined by the median of so many frames: two seconds at 15 fps, in which people pass by."""
 
 
 @dataclass(frozen=True, eq=False)
 class RefinementFrames:
-    """Frames for the pose to be refined by."""
+    """Frames of one refinement."""
 
     command: Command
     frames: list[NDArray[np.uint16]]
@@ -35,7 +35,7 @@ class RefinementFrames:
 
 
 class RefinementTask:
-    """One unit's refinements, one at a time."""
+    """Refinements of one unit's pose, one at a time."""
 
     def __init__(self, uplink: Uplink, assigned: AssignedPipeline, stance: PoseMonitor) -> None:
         self._uplink = uplink
@@ -44,23 +44,23 @@ class RefinementTask:
         self._gathered: RefinementFrames | None = None
 
     def begin(self, pipeline: DepthPipeline, command: Command) -> None:
-        """Gather frames from now on, as `command` asks."""
+        """Start to gather frames on `command`."""
         if self._gathered is not None:
-            self._uplink.finish(self._gathered.command, Outcome("superseded", "it was asked to begin anew"))
+            self._uplink.finish(self._gathered.command, Outcome("superseded", "a newer command started it anew"))
         self._gathered = RefinementFrames(command, [], pipeline.refiner())
 
     def gather(self, pipeline: DepthPipeline, depth: NDArray[np.uint16], joints: JointEstimate | None) -> None:
-        """Keep a frame (H, W) without the robot, when the pose is to be refined."""
+        """Keep a frame (H, W) without the robot's pixels, if a refinement needs frames."""
         gathered = self._gathered
         if gathered is None or len(gathered.frames) == REFINE_FRAMES:
             return
         if joints is None and pipeline.cell.robot is not None:
-            # Wherever it may stand: it must not be taken for CAD.
+            # Without joints its position is not known, and it must not be taken for CAD.
             return
         gathered.frames.append(pipeline.without_robot(depth, None if joints is None else joints.positions))
 
     def take(self) -> RefinementFrames | None:
-        """The frames, once there are enough: then they are no longer kept."""
+        """Return the frames once there are enough, and stop gathering; else None."""
         gathered = self._gathered
         if gathered is None or len(gathered.frames) < REFINE_FRAMES:
             return None
@@ -68,7 +68,7 @@ class RefinementTask:
         return gathered
 
     async def refine(self, gathered: RefinementFrames) -> None:
-        """Refine the pose by the frames gathered, while others are processed, and tell the master."""
+        """Refine the pose by the gathered frames in the background, and report it to the master."""
         try:
             found = await asyncio.to_thread(gathered.refiner.refine, gathered.frames)
             pipeline = self._assigned.pipeline
@@ -76,7 +76,7 @@ class RefinementTask:
                 self._uplink.finish(gathered.command, Outcome("superseded", POSE_CHANGED))
                 return
             if found.accepted:
-                # Of a camera that moved, what was learned shows another place.
+                # If the camera was moved, its background model shows another place.
                 self._assigned.refined = None if self._stance.verdict.moved else found.T_world_camera
                 await self._uplink.tell_pose(found.T_world_camera, "refined", PoseQuality())
         except CellwatchError as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a unit fares, in one line for a person: its trouble, or its frames a second."""
+"""The state of a unit in one line for a person: its trouble, or its frames a second."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ logger = logging.getLogger(__name__)
 
 
 class UnitStatus:
-    """The trouble of the last frame, and the frames since the status was asked for last."""
+    """The trouble of the last frame, and the number of frames since the last call of `line`."""
 
     def __init__(self, now_ns: int) -> None:
         self._trouble: str | None = "no frame yet"
@@ -19,18 +19,18 @@ class UnitStatus:
         self._asked = 0, now_ns
 
     def note_frame(self, trouble: str | None) -> None:
-        """Count a processed frame; the log says when trouble begins or ends."""
+        """Count a processed frame; log the begin and the end of trouble."""
         self._frames += 1
         if (trouble is None) != (self._trouble is None):
             logger.info("%s", trouble or "frames are filtered and reported")
         self._trouble = trouble
 
     def note_trouble(self, trouble: str) -> None:
-        """Take note of why frames are not processed."""
+        """Record the reason for which frames are not processed."""
         self._trouble = trouble
 
     def line(self, camera_trouble: str | None, now_ns: int) -> str:
-        """Return the camera's trouble, that of the last frame, or frames a second since it was asked last."""
+        """Return the camera's trouble, else that of the last frame, else frames a second since the last call."""
         (before, since_ns), self._asked = self._asked, (self._frames, now_ns)
         fps = (self._frames - before) * NS_PER_S / max(now_ns - since_ns, 1)
         return camera_trouble or self._trouble or f"live, {fps:.1f} fps"

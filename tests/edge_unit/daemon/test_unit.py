@@ -231,7 +231,7 @@ async def test_a_frame_that_hangs_is_told_and_waiting_for_a_camera_is_not(
         monkeypatch.setattr(FrameProcessor, "process", lambda *_: release.wait(30.0))
         bench.show(patch(1225))
         stuck = await bench.until(bench.unit.stuck, "a frame that hangs")
-        assert stuck.startswith("frame 2 has not come to its end for 0 s")
+        assert stuck.startswith("frame 2 has not finished for 0 s")
         release.set()
 
 

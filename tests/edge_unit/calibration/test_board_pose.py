@@ -145,7 +145,7 @@ REFUSED: dict[str, tuple[Callable[[], list[NDArray[np.uint8]]], str]] = {
     ),
     "moved": (
         lambda: [image for z in (0.8, 0.9, 1.0, 1.1) for image in pictures(before(TILTED, z), count=3)],
-        "agree on a pose|from picture to picture",
+        "agree on a pose|from image to image",
     ),
     "few frames": (
         lambda: pictures(before(TILTED, 0.8), count=MIN_FRAMES - 1),

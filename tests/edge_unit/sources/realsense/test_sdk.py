@@ -64,7 +64,7 @@ except SourceError as error:
 def test_where_the_sdk_is_missing_it_is_told_what_to_install(tmp_path: Path) -> None:
     (tmp_path / "pyrealsense2.py").write_text("raise ImportError('no such SDK')")
     ended = run(ASKED, path=tmp_path)
-    assert ended.stdout.startswith("the RealSense SDK cannot be loaded: no such SDK; it takes the packages ")
+    assert ended.stdout.startswith("the RealSense SDK cannot be loaded: no such SDK; install the packages ")
     assert "pip install 'cellwatch[realsense]'" in ended.stdout
 
 

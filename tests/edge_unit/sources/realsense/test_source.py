@@ -163,13 +163,13 @@ async def test_a_recording_cut_in_half_is_refused_with_its_name(recording: Path,
     half = tmp_path / "half.db3"
     half.write_bytes(recording.read_bytes()[: recording.stat().st_size // 2])
     source = RealsenseSource(RealsenseSourceConfig(recording=half))
-    with pytest.raises(SourceError, match=r"half\.db3: no recording that can be played; it may have been cut short"):
+    with pytest.raises(SourceError, match=r"half\.db3: expected a recording that can be played; it may be truncated"):
         await source.open()
     assert source.pid is None
 
 
 async def test_a_missing_recording_is_named() -> None:
-    with pytest.raises(SourceError, match=r"nowhere\.db3: there is no such recording"):
+    with pytest.raises(SourceError, match=r"nowhere\.db3: expected a recording"):
         await RealsenseSource(RealsenseSourceConfig(recording=Path("nowhere.db3"))).open()
 
 
@@ -205,7 +205,7 @@ async def test_a_hung_capture_process_is_told_within_a_second_and_replaced(recor
         stopped_ns = monotonic_ns()
         status = await until(source, lambda status: status.state != "live")
         assert status.since_ns - stopped_ns < NS_PER_S
-        assert status.trouble == "camera silent: no frame comes from the camera"
+        assert status.trouble == "camera silent: the camera sends no frames"
         status = await until(source, lambda status: status.state == "live")
         assert status.since_ns - stopped_ns < 4 * NS_PER_S
         assert source.pid != hung
@@ -259,7 +259,7 @@ async def test_an_absent_camera_is_named_with_what_is_there() -> None:
     source = RealsenseSource(RealsenseSourceConfig(serial="123456", open_timeout_s=1.0))
     opening = asyncio.create_task(source.open())
     status = await until(source, lambda status: status.state == "absent")
-    assert status.trouble == "camera absent: no RealSense camera 123456 is connected (there is none)"
+    assert status.trouble == "camera absent: no RealSense camera 123456 is connected (connected: none)"
     with pytest.raises(SourceError, match="no RealSense camera 123456 is connected"):
         await opening
     assert source.status.state == "closed"
@@ -287,7 +287,7 @@ async def test_a_camera_may_be_unplugged_and_plugged_in_again(recording: Path, t
         assert status.reason == "camera SYN0001 was unplugged"
         assert status.since_ns - unplugged_ns < NS_PER_S // 2
         status = await until(source, lambda status: status.state == "absent")
-        assert status.reason == "no RealSense camera SYN0001 is connected (there is none)"
+        assert status.reason == "no RealSense camera SYN0001 is connected (connected: none)"
         await asyncio.to_thread(plug, sockets, [recording])
         await until(source, lambda status: status.state == "live")
     await asyncio.sleep(0.2)

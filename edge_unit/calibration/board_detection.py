@@ -55,9 +55,9 @@ class Detection:
 
     Attributes:
         points_m: (N, 3) seen points in the board's frame.
-            pixels: (N, 2) their pixels in the image, undistorted.
-            point_ids: (N,) their indices among the board's points.
-            markers: number of the board's markers seen, in agreement with the board or not.
+        pixels: (N, 2) their pixels in the image, undistorted.
+        point_ids: (N,) their indices among the board's points.
+        markers: number of the board's markers seen, in agreement with the board or not.
         marker_px: median edge of these, pixels.
         agreeing: share of the points that lie as on the board.
     """

@@ -24,10 +24,10 @@ class BoardLayout:
     """A board in OpenCV's terms.
 
     Attributes:
-            board: the board's description in the cell.
-            aruco: OpenCV's board object.
-            dictionary: the dictionary of its markers.
-            ids: (M,) ids of its markers.
+        board: the board's description in the cell.
+        aruco: OpenCV's board object.
+        dictionary: the dictionary of its markers.
+        ids: (M,) ids of its markers.
         marker_corners_m: (M, 4, 2) x and y in the board's frame, clockwise as printed from the top left.
         size_m: width and height of the printed pattern.
     """
@@ -44,7 +44,7 @@ class BoardLayout:
         """Make the layout of `board`.
 
         Raises:
-                CellError: OpenCV has no such dictionary, or the dictionary has too few markers.
+            CellError: OpenCV has no such dictionary, or the dictionary has too few markers.
         """
         name = board.dictionary
         number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
@@ -106,7 +106,7 @@ def require_board(board: Board | None) -> Board:
     """Return the cell's board.
 
     Raises:
-            InputError: the cell has no board.
+        InputError: the cell has no board.
     """
     if board is None:
         raise InputError("the cell has no board: describe the printed one under `board` in cell.yaml")

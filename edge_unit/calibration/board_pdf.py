@@ -48,7 +48,7 @@ def page_of(layout: BoardLayout, name: str) -> Page:
     """Return the sheet of this name, portrait or landscape.
 
     Raises:
-            InputError: there is no such sheet, or the board does not fit; the text names the sheets that it fits.
+        InputError: there is no such sheet, or the board does not fit; the text names the sheets that it fits.
     """
     if name.upper() not in PAGES:
         raise InputError(f"page: expected one of {', '.join(PAGES)}, got {name}")
@@ -67,7 +67,7 @@ def smallest_page(layout: BoardLayout) -> str:
     """Return the name of the smallest sheet that fits the board.
 
     Raises:
-            InputError: no sheet fits.
+        InputError: no sheet fits.
     """
     for name in PAGES:
         if _fitting(layout, name) is not None:

@@ -81,9 +81,9 @@ class Localisation:
     Attributes:
         T_world_camera: (4, 4), the depth camera's optical frame.
         uncertainty_mm, uncertainty_deg: standard error of position and rotation, all axes together.
-            reprojection_px: RMS distance from the points to their positions by the pose, median of the frames.
-            frames_used, frames_seen: frames in the mean, and all frames examined.
-            markers, markers_total: median number seen in a frame, and the board's number.
+        reprojection_px: RMS distance from the points to their positions by the pose, median of the frames.
+        frames_used, frames_seen: frames in the mean, and all frames examined.
+        markers, markers_total: median number seen in a frame, and the board's number.
     """
 
     T_world_camera: Transform
@@ -155,7 +155,7 @@ class BoardLocaliser:
         """Return the pose from all images.
 
         Raises:
-                BoardError: they do not give it; one sentence with the reason and the remedy.
+            BoardError: they do not give it; one sentence with the reason and the remedy.
         """
         seen = self._sightings
         posed = self._posed

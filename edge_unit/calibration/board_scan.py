@@ -59,9 +59,9 @@ class BoardSearch:
         """Take images until they give the pose, or will not; `tell` receives the progress meanwhile.
 
         Raises:
-                BoardError: the images do not give a pose; one sentence with the remedy.
+            BoardError: the images do not give a pose; one sentence with the remedy.
             CellError: OpenCV has no such board.
-                SourceError: the camera delivers no images.
+            SourceError: the camera delivers no images.
         """
         source = self._source
         if not isinstance(source, ImageSource):

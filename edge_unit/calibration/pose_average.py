@@ -32,8 +32,8 @@ class PoseMean:
 
     Attributes:
         pose: (4, 4).
-            used: (N,) the measurements in the mean.
-                spread: (6, 6) covariance of a single measurement: position (m) in the reference frame, then rotation
+        used: (N,) the measurements in the mean.
+            spread: (6, 6) covariance of a single measurement: position (m) in the reference frame, then rotation
                     (rad) in the moving one.
     """
 
@@ -56,7 +56,7 @@ def mean_pose(poses: NDArray[np.float64]) -> PoseMean:
     """Return the mean of `poses` (N, 4, 4): arithmetic of positions, Karcher's of rotations.
 
     Raises:
-            InputError: there is no pose.
+        InputError: there is no pose.
     """
     if not len(poses):
         raise InputError("poses: expected at least one, got none")

@@ -31,8 +31,8 @@ class FrameProcessor:
 
     Attributes:
         assigned: the pipeline as the master's latest assignment has it.
-            learning: the background model, and the run that learns it.
-            joints: the robot's joints at a frame's time.
+        learning: the background model, and the run that learns it.
+        joints: the robot's joints at a frame's time.
     """
 
     def __init__(

@@ -20,10 +20,10 @@ class AssignedPipeline:
     """Built with the first assignment of each camera; each later assignment changes it between two frames.
 
     Attributes:
-            camera: the open camera, or the last one.
+        camera: the open camera, or the last one.
         pipeline: None until there is an assignment with a pose.
-            assignment: the assignment that the pipeline was built for.
-            refined: a refined pose; an assignment with this pose does not mean that the camera was moved.
+        assignment: the assignment that the pipeline was built for.
+        refined: a refined pose; an assignment with this pose does not mean that the camera was moved.
     """
 
     def __init__(self, learning: BackgroundLearning, stance: PoseMonitor) -> None:
@@ -49,7 +49,7 @@ class AssignedPipeline:
         """Return the pipeline for `assignment`; takes seconds if many meshes must be drawn.
 
         Raises:
-                InputError: the assignment is invalid; the pipeline stays as it was.
+            InputError: the assignment is invalid; the pipeline stays as it was.
         """
         assert self.camera is not None
         pipeline, applied = self.pipeline, self.assignment

@@ -4,9 +4,9 @@
 In the order of the flow:
 
     history               the last seconds of joints, interpolated to a frame's time
-        delay_estimation      the delay of the joints' times against the frames' times
-        delay_from_recording  the same from a recording
-        delay_monitor         the same while a unit runs, as a warning
+    delay_estimation      the delay of the joints' times against the frames' times
+    delay_from_recording  the same from a recording
+    delay_monitor         the same while a unit runs, as a warning
 """
 
 from edge_unit.joints.delay_estimation import DelayComparison, DelayEstimate, estimate_delay, look_at
@@ -15,8 +15,8 @@ from edge_unit.joints.delay_monitor import DelayMonitor
 from edge_unit.joints.history import JointEstimate, JointHistory
 
 __all__ = [
-    "DelayEstimate",
     "DelayComparison",
+    "DelayEstimate",
     "DelayMonitor",
     "JointEstimate",
     "JointHistory",

@@ -129,7 +129,7 @@ def estimate_delay(misfits: Collection[NDArray[np.float64]]) -> DelayEstimate:
     """Estimate the delay from results of `DelayComparison.misfits`.
 
     Raises:
-            InputError: there are too few frames, as the robot hardly moved; or no delay fits better than all others.
+        InputError: there are too few frames, as the robot hardly moved; or no delay fits better than all others.
     """
     if len(misfits) < LOOKS_MIN:
         raise InputError(

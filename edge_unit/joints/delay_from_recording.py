@@ -34,7 +34,7 @@ def delay_of_recording(config: RecordedSourceConfig, cell: Cell) -> DelayEstimat
 
     Raises:
         SourceError: a file is missing or malformed; names it.
-            InputError: the cell has no robot or the recording no pose; or as `estimate_delay` raises.
+        InputError: the cell has no robot or the recording no pose; or as `estimate_delay` raises.
     """
     return asyncio.run(_delay(config, cell))
 

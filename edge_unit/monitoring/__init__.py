@@ -5,11 +5,11 @@ In the order of the flow:
 
     host            the computer: its boot, its clock, its USB
     stage_timer     how long a frame spent in each stage of the unit
-        stall_detector  detects work on frames that does not end in time
-        last_camera     the camera of the last run, so that its absence can be reported
-        camera_status   the camera's status, reported to the master
-        pose_monitor    detects a camera that was moved or covered
-        trace           a file of all reports, frame by frame
+    stall_detector  detects work on frames that does not end in time
+    last_camera     the camera of the last run, so that its absence can be reported
+    camera_status   the camera's status, reported to the master
+    pose_monitor    detects a camera that was moved or covered
+    trace           a file of all reports, frame by frame
 """
 
 from edge_unit.monitoring.camera_status import CameraStatus
@@ -21,9 +21,9 @@ from edge_unit.monitoring.trace import Trace, TraceRecord, read_trace
 
 __all__ = [
     "CameraStatus",
-    "StallDetector",
-    "StageTimer",
     "PoseMonitor",
+    "StageTimer",
+    "StallDetector",
     "Trace",
     "TraceRecord",
     "Verdict",

@@ -109,7 +109,7 @@ def read_trace(path: Path) -> list[TraceRecord]:
     """Read the records of a trace; a truncated file yields all complete records.
 
     Raises:
-            ConfigError: the file cannot be read, or is not a trace.
+        ConfigError: the file cannot be read, or is not a trace.
     """
     records = []
     try:

@@ -94,7 +94,7 @@ class BackgroundModel:
         """Inverse of `to_bytes`.
 
         Raises:
-                InputError: the bytes are not a background model.
+            InputError: the bytes are not a background model.
         """
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as stored:
@@ -107,7 +107,7 @@ class BackgroundModel:
         """Write to `path`, whole or not at all.
 
         Raises:
-                OSError: it cannot be written; the old file stays.
+            OSError: it cannot be written; the old file stays.
         """
         write_whole(path, self.to_bytes())
 
@@ -116,7 +116,7 @@ class BackgroundModel:
         """Read a file of `save`.
 
         Raises:
-                InputError: the file is missing, too large, or not a background model.
+            InputError: the file is missing, too large, or not a background model.
         """
         try:
             if path.stat().st_size > FILE_BYTES_MAX:
@@ -158,7 +158,7 @@ class BackgroundLearner:
         """Add a frame (H, W), except for depths within the robot's band (H, W).
 
         Raises:
-                InputError: MAX_FRAMES are reached.
+            InputError: MAX_FRAMES are reached.
         """
         if self.frames >= MAX_FRAMES:
             raise InputError(f"reference: expected at most {MAX_FRAMES} frames")
@@ -169,7 +169,7 @@ class BackgroundLearner:
         """Return the background model of the frames so far.
 
         Raises:
-                InputError: there was no frame.
+            InputError: there was no frame.
         """
         if self.frames == 0:
             raise InputError("reference: expected at least one frame of the empty cell, got none")

@@ -46,14 +46,14 @@ class DepthPipeline:
         """Prepare everything that no frame changes.
 
         Args:
-                intrinsics: intrinsics of the depth camera.
+            intrinsics: intrinsics of the depth camera.
             T_world_camera: (4, 4) pose of its optical frame in the cell.
             cell: the watched workspace.
-                settings: None: the defaults.
+            settings: None: the defaults.
 
         Raises:
-                InputError: an argument has a wrong type, the pose is not a rigid transform, or the lattice would be too
-                    large.
+            InputError: an argument has a wrong type, the pose is not a rigid transform, or the lattice would be too
+                large.
         """
         self.intrinsics = _of_type(intrinsics, Intrinsics, "intrinsics")
         self.cell = _of_type(cell, Cell, "cell")
@@ -80,10 +80,10 @@ class DepthPipeline:
 
         Args:
             depth: (H, W) uint16 in units of depth_scale_m, 0 where nothing was measured.
-                joints: (n,) rad (m where prismatic) at the frame's time; None if they are not known: then the robot is
-                    reported, not filtered.
-                joint_uncertainty_rad: uncertainty of each joint, one number or (n,); it widens the padding.
-                with_misfit: also compare the frame with poses close to the camera's pose.
+            joints: (n,) rad (m where prismatic) at the frame's time; None if they are not known: then the robot is
+                reported, not filtered.
+            joint_uncertainty_rad: uncertainty of each joint, one number or (n,); it widens the padding.
+            with_misfit: also compare the frame with poses close to the camera's pose.
 
         Raises:
             InputError: depth or joints have the wrong type, shape or values.
@@ -132,7 +132,7 @@ class DepthPipeline:
             frames: pairs of depth (H, W) uint16 and joints (n,).
 
         Raises:
-                    InputError: there was no frame, one is not a pair, or the cell has a robot and joints are missing.
+                InputError: there was no frame, one is not a pair, or the cell has a robot and joints are missing.
         """
         learner = self.learner()
         pairs: Iterable[object] = _of_type(frames, Iterable, "frames")
@@ -164,7 +164,7 @@ class DepthPipeline:
         """Make `reference` part of the static layer from now on; None removes it.
 
         Raises:
-                InputError: it is not a background model, or is of another resolution; the old one stays.
+            InputError: it is not a background model, or is of another resolution; the old one stays.
         """
         self._static.use(None if reference is None else _of_type(reference, BackgroundModel, "reference"))
 
@@ -204,7 +204,7 @@ class DepthPipeline:
         """Use other settings from now on.
 
         Raises:
-                InputError: the type is wrong, or the lattice would be too large; the old settings stay.
+            InputError: the type is wrong, or the lattice would be too large; the old settings stay.
         """
         self.adopt(self.cell, settings)
 
@@ -212,7 +212,7 @@ class DepthPipeline:
         """Use another cell from now on, or the same with moved objects.
 
         Raises:
-                InputError: the type is wrong, or its lattice would be too large; the old cell stays.
+            InputError: the type is wrong, or its lattice would be too large; the old cell stays.
         """
         self.adopt(cell, self.settings)
 
@@ -222,7 +222,7 @@ class DepthPipeline:
         Only changes are prepared anew: the robot and meshes that are the same objects as before are kept.
 
         Raises:
-                InputError: an argument has a wrong type, or the lattice would be too large; the old ones stay.
+            InputError: an argument has a wrong type, or the lattice would be too large; the old ones stay.
         """
         _of_type(cell, Cell, "cell")
         _of_type(settings, FilterSettings, "settings")
@@ -245,7 +245,7 @@ class DepthPipeline:
         camera did not move, and only the knowledge of its pose is better.
 
         Raises:
-                InputError: the pose is not a rigid transform; the old one stays.
+            InputError: the pose is not a rigid transform; the old one stays.
         """
         self.T_world_camera = validated(T_world_camera, "T_world_camera")
         self._voxelizer.place(self.T_world_camera)

@@ -69,9 +69,9 @@ class RobotLayer:
     """The padded robot, as the band of raw depths that it covers.
 
     Attributes:
-            padding_m: (L,) float32, the usual padding of the links.
+        padding_m: (L,) float32, the usual padding of the links.
         near_raw, span_raw: (H, W) uint16, the band's lower end and its length.
-            columns: (H, 2) int32, for each row the first column and the one after the last that may have a band.
+        columns: (H, 2) int32, for each row the first column and the one after the last that may have a band.
         bundle: all three, for kernels.
     """
 

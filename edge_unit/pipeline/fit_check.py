@@ -22,10 +22,10 @@ class Health:
     """The health of a frame, which each update carries.
 
     Attributes:
-            valid_share: share of the measured pixels.
-            agreeing_share: share of the measured pixels on a known static surface that lie within its margin.
-            residual_share: median of measured less expected depth of those, in parts of the margin (-1 to 1).
-            static_share: share of the pixels on a known static surface; where it is 0 the two above are 0 too.
+        valid_share: share of the measured pixels.
+        agreeing_share: share of the measured pixels on a known static surface that lie within its margin.
+        residual_share: median of measured less expected depth of those, in parts of the margin (-1 to 1).
+        static_share: share of the pixels on a known static surface; where it is 0 the two above are 0 too.
     """
 
     valid_share: float

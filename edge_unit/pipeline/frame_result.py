@@ -17,11 +17,11 @@ class FrameResult:
     """The result of one frame.
 
     Attributes:
-            voxels: the obstacle voxels, which no known surface explains.
+        voxels: the obstacle voxels, which no known surface explains.
         seen: the blocks of the cell that the frame looks through.
-            health: the fit of the frame to the known surfaces.
-            times: the time that each stage took.
-            misfit: misfit of the frame at the camera's pose and at neighbouring poses; None if not requested.
+        health: the fit of the frame to the known surfaces.
+        times: the time that each stage took.
+        misfit: misfit of the frame at the camera's pose and at neighbouring poses; None if not requested.
     """
 
     voxels: Voxels

@@ -23,7 +23,7 @@ class MovingModel:
 
     Attributes:
         robot: None in a cell without one.
-            band: the depths that the padded robot covers at its last joints.
+        band: the depths that the padded robot covers at its last joints.
     """
 
     def __init__(
@@ -65,8 +65,8 @@ class MovingModel:
         """Draw the padded robot at the frame's time; returns its band of depths.
 
         Args:
-                joints: (n,) rad (m where prismatic); None if they are not known: then the band is empty.
-                joint_uncertainty_rad: uncertainty of each joint, one number or (n,); it widens the padding.
+            joints: (n,) rad (m where prismatic); None if they are not known: then the band is empty.
+            joint_uncertainty_rad: uncertainty of each joint, one number or (n,); it widens the padding.
             without_fixed_links: leave out the links that never move.
 
         Raises:

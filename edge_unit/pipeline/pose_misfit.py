@@ -42,10 +42,10 @@ class Misfit:
 
     Attributes:
         slope: (6,) misfit a pixel one step ahead on each axis less that one step back; 0 where the pose is right.
-            curvature: (6,) the sum of both less twice the misfit of the expected pose: how well an axis is determined.
-            valid_share: share of the measured pixels.
-            beyond_share: of the pixels compared, the share that is farther away than the known surface.
-            static_share: share of the pixels on a known static surface.
+        curvature: (6,) the sum of both less twice the misfit of the expected pose: how well an axis is determined.
+        valid_share: share of the measured pixels.
+        beyond_share: of the pixels compared, the share that is farther away than the known surface.
+        static_share: share of the pixels on a known static surface.
     """
 
     slope: NDArray[np.float64]

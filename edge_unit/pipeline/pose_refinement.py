@@ -66,11 +66,11 @@ class Refinement:
     """The result of a refinement.
 
     Attributes:
-            T_world_camera: the refined pose; the old one if it was not accepted.
-            accepted: True if it is better, and near.
-            reason: the gain in words, or the reason against it.
+        T_world_camera: the refined pose; the old one if it was not accepted.
+        accepted: True if it is better, and near.
+        reason: the gain in words, or the reason against it.
         before_mm, after_mm: median distance of the measured points from the known planes.
-            moved_mm, moved_deg: distance of the refined pose from the old one.
+        moved_mm, moved_deg: distance of the refined pose from the old one.
     """
 
     T_world_camera: Transform

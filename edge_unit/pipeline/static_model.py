@@ -29,11 +29,11 @@ class StaticImages:
 
     Attributes:
         minimum_raw: the nearest raw depth that counts.
-                room_raw: uint16, a depth at least this far beyond `minimum_raw` is explained by a static surface.
-            seen_limit_raw: uint16, the depth up to which a pixel's ray surely meets no static surface.
+            room_raw: uint16, a depth at least this far beyond `minimum_raw` is explained by a static surface.
+        seen_limit_raw: uint16, the depth up to which a pixel's ray surely meets no static surface.
         depth_m: float32, depth of the nearest surface, unpadded; inf where nothing is known.
         depth_raw: uint16, the same in raw units; 0 where nothing is known.
-            standing_raw: uint16, as `depth_raw` without known objects, which may be carried away before it is reported.
+        standing_raw: uint16, as `depth_raw` without known objects, which may be carried away before it is reported.
     """
 
     minimum_raw: int
@@ -81,10 +81,10 @@ class StaticModel:
 
     Attributes:
         bodies: CAD and known objects.
-            reference: the background model; None if there is none.
-            images: the images that a frame is compared with.
-            halo: the false depths beside edges of the CAD.
-            version: rises with each change of these.
+        reference: the background model; None if there is none.
+        images: the images that a frame is compared with.
+        halo: the false depths beside edges of the CAD.
+        version: rises with each change of these.
     """
 
     def __init__(self, intrinsics: Intrinsics, bodies: Bodies, settings: FilterSettings) -> None:
@@ -110,7 +110,7 @@ class StaticModel:
         """Make `reference` part of the model; None removes it.
 
         Raises:
-                InputError: it is of another resolution; the old one stays.
+            InputError: it is of another resolution; the old one stays.
         """
         if reference is not None and reference.depth_m.shape != self._intrinsics.shape:
             raise InputError(

@@ -25,9 +25,9 @@ class Voxels:
     """Obstacle voxels of one frame.
 
     Attributes:
-            keys: (N,) uint32, ascending, in the order of `Lattice.keys`.
-            counts: (N,) uint32, the number of foreground pixels in each.
-            lattice: the lattice of the keys.
+        keys: (N,) uint32, ascending, in the order of `Lattice.keys`.
+        counts: (N,) uint32, the number of foreground pixels in each.
+        lattice: the lattice of the keys.
     """
 
     keys: NDArray[np.uint32]

@@ -47,7 +47,7 @@ class DepthSource(Protocol):
         """Start the camera.
 
         Raises:
-                SourceError: it is absent, or does not start; the text says what to do.
+            SourceError: it is absent, or does not start; the text says what to do.
         """
         ...
 

@@ -70,6 +70,6 @@ class ImageSource(Protocol):
         """Pause depth and deliver images; depth resumes at the end of the context.
 
         Raises:
-                SourceError: the source is not open, or has no such stream.
+            SourceError: the source is not open, or has no such stream.
         """
         ...

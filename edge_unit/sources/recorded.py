@@ -107,7 +107,7 @@ class RecordedSource:
         """Read the folder's index.
 
         Raises:
-                SourceError: a file is missing or malformed; the text names it.
+            SourceError: a file is missing or malformed; the text names it.
         """
         self._recording = await asyncio.to_thread(_open, self._config)
         return self._recording.info
@@ -116,7 +116,7 @@ class RecordedSource:
         """Yield the frames in order, at the configured rate; stops at the end unless it loops.
 
         Raises:
-                SourceError: the source is not open, or an image cannot be read or does not fit.
+            SourceError: the source is not open, or an image cannot be read or does not fit.
         """
         recording = self._recording
         if recording is None:
@@ -145,7 +145,7 @@ def read_pose(path: Path) -> Transform:
     """Read a 4x4 matrix from a text file.
 
     Raises:
-            ConfigError: it cannot be read, or is not a rigid transform; the text names the file.
+        ConfigError: it cannot be read, or is not a rigid transform; the text names the file.
     """
     try:
         return validated(np.loadtxt(path, ndmin=2), "T_world_camera")
@@ -157,7 +157,7 @@ def open_recording(config: RecordedSourceConfig) -> CameraInfo:
     """Read the camera of a recording, without its frames.
 
     Raises:
-            SourceError: a file is missing or malformed; the text names it.
+        SourceError: a file is missing or malformed; the text names it.
     """
     return _open(config).info
 

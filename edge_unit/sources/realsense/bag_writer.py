@@ -33,7 +33,7 @@ def record_images(images: RecordedSourceConfig, path: Path, fps: float = DEFAULT
     one.
 
     Raises:
-            SourceError: an image cannot be read, or the recording cannot be written; the text names the file.
+        SourceError: an image cannot be read, or the recording cannot be written; the text names the file.
     """
     command = (
         sys.executable,

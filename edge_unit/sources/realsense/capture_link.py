@@ -189,7 +189,7 @@ def receive(end: socket.socket) -> tuple[Message, int | None] | None:
     """Receive the next message and its open file; None if the other end is gone.
 
     Raises:
-            BlockingIOError: there is no message, and `end` does not block.
+        BlockingIOError: there is no message, and `end` does not block.
     """
     try:
         packet, descriptors, _, _ = socket.recv_fds(end, MAX_PACKET_BYTES, 1)

@@ -73,7 +73,7 @@ class CaptureSupervisor:
         """Return the camera, once it streams.
 
         Raises:
-                SourceError: it does not stream within `timeout_s`; the text has the reason.
+            SourceError: it does not stream within `timeout_s`; the text has the reason.
         """
         await within(timeout_s, self._known.wait())
         if self.failure is not None:
@@ -106,7 +106,7 @@ class CaptureSupervisor:
         """Yield frames as they come, each valid until the next is requested; ends with the recording, or on `close`.
 
         Raises:
-                SourceError: there will be no more frames.
+            SourceError: there will be no more frames.
         """
         while True:
             self.news.clear()
@@ -233,7 +233,7 @@ class CaptureSupervisor:
         """Accept a stream that equals the one opened first, or refuse it.
 
         Raises:
-                SourceError: its camera or lens differs: all that was prepared for the first one is void.
+            SourceError: its camera or lens differs: all that was prepared for the first one is void.
         """
         if self.opened is not None and _identity(opened) != _identity(self.opened):
             raise SourceError(

@@ -73,7 +73,7 @@ class Devices:
         """Reset the hardware of `device`, and return the device that reappears.
 
         Raises:
-                SourceError: no device reappeared.
+            SourceError: no device reappeared.
         """
         self.removed.clear()
         device.hardware_reset()

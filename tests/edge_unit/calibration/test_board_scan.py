@@ -100,7 +100,7 @@ async def test_without_a_board_it_looks_ever_less_often() -> None:
 async def test_a_source_without_pictures() -> None:
     search = BoardSearch(object(), "infrared")
     assert not search.due(monotonic_ns())
-    with pytest.raises(BoardError, match="no pictures"):
+    with pytest.raises(BoardError, match="no images"):
         await search.look(BOARD, lambda seen: None)
     with pytest.raises(SourceError, match="no picture"):
         await BoardSearch(Pictures(), "infrared").look(BOARD, lambda seen: None)

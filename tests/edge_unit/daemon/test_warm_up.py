@@ -43,7 +43,10 @@ def test_the_first_frame_needs_no_kernel_that_was_not_rehearsed() -> None:
 
 def test_no_reader_of_meshes_is_imported_for_it() -> None:
     # Half a second, which would be half of a start.
-    code = "import sys; from edge_unit.daemon.warm_up import warm_up_kernels; warm_up_kernels(); sys.exit('trimesh' in sys.modules)"
+    code = (
+        "import sys; from edge_unit.daemon.warm_up import warm_up_kernels; warm_up_kernels(); "
+        "sys.exit('trimesh' in sys.modules)"
+    )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=110)
 
 

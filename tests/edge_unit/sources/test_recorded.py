@@ -206,7 +206,7 @@ async def test_a_frame_that_is_not_there_is_named(folder: Path) -> None:
 
 
 async def test_frames_before_opening_are_an_error(folder: Path) -> None:
-    with pytest.raises(SourceError, match="before it was opened"):
+    with pytest.raises(SourceError, match="expected an open source"):
         async for _ in source(folder).frames():
             pass
 

@@ -41,7 +41,7 @@ class FrameProcessor:
         assigned: AssignedPipeline,
         learning: BackgroundLearning,
         refining: RefinementTask,
-        stance: PoseMonitor,
+        monitor: PoseMonitor,
         joints: FrameJoints,
     ) -> None:
         """`finish` receives the outcome of each command."""
@@ -49,7 +49,7 @@ class FrameProcessor:
         self.assigned = assigned
         self.learning = learning
         self._refining = refining
-        self._stance = stance
+        self._monitor = monitor
         self.joints = joints
 
     def process(
@@ -81,10 +81,10 @@ class FrameProcessor:
                 self._finish(command, Outcome("refused", str(error)))
             raise
         for command in changes:
-            self._obey(command, pipeline)
+            self._execute(command, pipeline)
         return pipeline
 
-    def _obey(self, command: Command, pipeline: DepthPipeline) -> None:
+    def _execute(self, command: Command, pipeline: DepthPipeline) -> None:
         """Carry out a command; one that needs several frames only starts here."""
         if command.verb == "learn_background":
             self.learning.begin(pipeline, command)
@@ -106,13 +106,13 @@ class FrameProcessor:
         """Filter a frame, and judge the health of its camera."""
         stages.end("thread")
         positions, uncertainty = known(joints)
-        is_due = self._stance.due(frame.captured_at_ns)
+        is_due = self._monitor.due(frame.captured_at_ns)
         result = pipeline.process(frame.depth, positions, joint_uncertainty_rad=uncertainty, with_misfit=is_due)
         stages.end("check", parts_of(result.times))
         voxels, seen, crowd = within_bounds(result, pipeline.T_world_camera)
-        stance = self._stance.watch(result.misfit, pipeline.static_version, frame.captured_at_ns)
-        warning = stance.warning or self.joints.warning(assignment.settings.joint_delay_s) or crowd
-        health = health_of(result, frame, stance, warning)
+        verdict = self._monitor.watch(result.misfit, pipeline.static_version, frame.captured_at_ns)
+        warning = verdict.warning or self.joints.warning(assignment.settings.joint_delay_s) or crowd
+        health = health_of(result, frame, verdict, warning)
         self._refining.gather(pipeline, frame.depth, joints)
         keys = keys_to_bytes(voxels.keys)
         stages.end("report")
@@ -127,8 +127,8 @@ class FrameProcessor:
             look = self.joints.watch_delay(pipeline, frame)
             if look is not None:
                 yield asyncio.to_thread(look)
-        if self._stance.unsaved:
-            yield asyncio.to_thread(self._stance.save)
+        if self._monitor.unsaved:
+            yield asyncio.to_thread(self._monitor.save)
         gathered = self._refining.take()
         if gathered is not None:
             yield self._refining.refine(gathered)

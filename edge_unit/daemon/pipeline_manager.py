@@ -26,9 +26,9 @@ class AssignedPipeline:
         refined: a refined pose; an assignment with this pose does not mean that the camera was moved.
     """
 
-    def __init__(self, learning: BackgroundLearning, stance: PoseMonitor) -> None:
+    def __init__(self, learning: BackgroundLearning, monitor: PoseMonitor) -> None:
         self._learning = learning
-        self._stance = stance
+        self._monitor = monitor
         self.camera: CameraInfo | None = None
         self.pipeline: DepthPipeline | None = None
         self.assignment: Assignment | None = None
@@ -78,7 +78,7 @@ class AssignedPipeline:
     def _settle(self, pipeline: DepthPipeline) -> None:
         """Load the background model and the usual fit of the camera at this place."""
         place = self.place
-        self._stance.begin(place_of(place.camera.serial, place.camera.intrinsics.shape, place.T_world_camera))
+        self._monitor.begin(place_of(place.camera.serial, place.camera.intrinsics.shape, place.T_world_camera))
         self._learning.find(pipeline, place)
 
 

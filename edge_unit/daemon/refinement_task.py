@@ -37,10 +37,10 @@ class RefinementFrames:
 class RefinementTask:
     """Refinements of one unit's pose, one at a time."""
 
-    def __init__(self, uplink: Uplink, assigned: AssignedPipeline, stance: PoseMonitor) -> None:
+    def __init__(self, uplink: Uplink, assigned: AssignedPipeline, monitor: PoseMonitor) -> None:
         self._uplink = uplink
         self._assigned = assigned
-        self._stance = stance
+        self._monitor = monitor
         self._gathered: RefinementFrames | None = None
 
     def begin(self, pipeline: DepthPipeline, command: Command) -> None:
@@ -77,7 +77,7 @@ class RefinementTask:
                 return
             if found.accepted:
                 # If the camera was moved, its background model shows another place.
-                self._assigned.refined = None if self._stance.verdict.moved else found.T_world_camera
+                self._assigned.refined = None if self._monitor.verdict.moved else found.T_world_camera
                 await self._uplink.tell_pose(found.T_world_camera, "refined", PoseQuality())
         except CellwatchError as error:
             self._uplink.finish(gathered.command, Outcome("failed", str(error)))

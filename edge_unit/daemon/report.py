@@ -33,7 +33,7 @@ def parts_of(times: StageTimes) -> dict[str, int]:
     }
 
 
-def health_of(result: FrameResult, frame: DepthFrame, stance: Verdict, warning: str | None) -> Health:
+def health_of(result: FrameResult, frame: DepthFrame, verdict: Verdict, warning: str | None) -> Health:
     """Return the health of the camera after a frame."""
     fit = result.health
     return Health(
@@ -43,8 +43,8 @@ def health_of(result: FrameResult, frame: DepthFrame, stance: Verdict, warning: 
         static_share=fit.static_share,
         process_ms=round(result.times.total_ns / NS_PER_MS, 3),
         frame=frame.frame_number,
-        moved=stance.moved or None,
-        blind=stance.blind or None,
+        moved=verdict.moved or None,
+        blind=verdict.blind or None,
         warning=warning,
     )
 

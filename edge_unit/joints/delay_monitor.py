@@ -35,17 +35,17 @@ _DELAYS_NS = np.rint(DELAYS_S * NS_PER_S).astype(np.int64)
 _HALF_SPAN_NS = round(0.5 * MOTION_SPAN_S * NS_PER_S)
 
 
-class _Looks:
+class _Comparisons:
     """Comparisons of frames with the same static surfaces: the data of the thread, and nothing else."""
 
-    def __init__(self, look: DelayComparison) -> None:
-        self.look = look
+    def __init__(self, comparison: DelayComparison) -> None:
+        self.comparison = look
         self.estimate: DelayEstimate | None = None
         self._misfits: deque[NDArray[np.float64]] = deque(maxlen=LOOKS_MAX)
 
     def add(self, thinned_m: NDArray[np.float32], joints: list[NDArray[np.float64]]) -> None:
         """Compare a frame; joints (n,) at each of the delays."""
-        self._misfits.append(self.look.misfits(thinned_m, joints))
+        self._misfits.append(self.comparison.misfits(thinned_m, joints))
         try:
             self.estimate = estimate_delay(self._misfits)
         except InputError:
@@ -61,10 +61,10 @@ class DelayMonitor:
 
     def __init__(self) -> None:
         self._made_for: tuple[object, ...] = ()
-        self._looks: _Looks | None = None
+        self._comparisons: _Comparisons | None = None
         self._kept: tuple[int, NDArray[np.float32]] | None = None
         self._due_ns = 0
-        self._looking = False
+        self._is_comparing = False
 
     def due(self, at_ns: int) -> bool:
         """Return True if the frame captured at `at_ns` should be kept; also after a clock that went back."""
@@ -76,8 +76,8 @@ class DelayMonitor:
         if robot is None:
             return
         made_for = pipeline, robot, pipeline.static_version
-        if self._looks is None or made_for != self._made_for:
-            self._looks = _Looks(
+        if self._comparisons is None or made_for != self._made_for:
+            self._comparisons = _Comparisons(
                 DelayComparison(
                     pipeline.intrinsics,
                     pipeline.T_world_camera,
@@ -87,7 +87,7 @@ class DelayMonitor:
                 )
             )
             self._made_for = made_for
-        self._kept = at_ns, self._looks.look.thinned(depth)
+        self._kept = at_ns, self._comparisons.comparison.thinned(depth)
         self._due_ns = at_ns + PERIOD_NS
 
     def next_comparison(self, history: JointHistory) -> Callable[[], None] | None:
@@ -96,8 +96,13 @@ class DelayMonitor:
         None while joints from after the frame are not known, no frame is kept, the robot did not move, or the previous
         comparison is still running.
         """
-        kept, looks = self._kept, self._looks
-        if kept is None or looks is None or self._looking or history.newest_ns < kept[0] + int(_DELAYS_NS[-1]):
+        kept, comparisons = self._kept, self._comparisons
+        if (
+            kept is None
+            or comparisons is None
+            or self._is_comparing
+            or history.newest_ns < kept[0] + int(_DELAYS_NS[-1])
+        ):
             return None
         self._kept = None
         found = [
@@ -105,20 +110,22 @@ class DelayMonitor:
             for offset_ns in (-_HALF_SPAN_NS, _HALF_SPAN_NS, *_DELAYS_NS)
         ]
         positions = [each.positions for each in found if each is not None]
-        if len(positions) < len(found) or not looks.look.moves(*positions[:2]):
+        if len(positions) < len(found) or not comparisons.comparison.moves(*positions[:2]):
             return None
-        self._looking = True
-        return partial(self._look, looks, kept[1], positions[2:])
+        self._is_comparing = True
+        return partial(self._compare, comparisons, kept[1], positions[2:])
 
-    def _look(self, looks: _Looks, thinned_m: NDArray[np.float32], joints: list[NDArray[np.float64]]) -> None:
+    def _compare(
+        self, comparisons: _Comparisons, thinned_m: NDArray[np.float32], joints: list[NDArray[np.float64]]
+    ) -> None:
         try:
-            looks.add(thinned_m, joints)
+            comparisons.add(thinned_m, joints)
         finally:
-            self._looking = False
+            self._is_comparing = False
 
     def warning(self, joint_delay_s: float) -> str | None:
         """Return the value to set instead of `joint_delay_s` if that is clearly wrong, else None."""
-        found = None if self._looks is None else self._looks.estimate
+        found = None if self._comparisons is None else self._comparisons.estimate
         if found is None:
             return None
         off_s = found.delay_s - joint_delay_s

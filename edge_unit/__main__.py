@@ -66,7 +66,7 @@ def _run(options: argparse.Namespace) -> int:
     from edge_unit.source_factory import FACTORIES, make_source
 
     source = make_source(config.source, {**FACTORIES, **options.factories})
-    asyncio.run(_until_told_to_stop(Unit(config, source)))
+    asyncio.run(_run_until_stopped(Unit(config, source)))
     return 0
 
 
@@ -138,14 +138,14 @@ def _compile_kernels(options: argparse.Namespace) -> int:
     if options.config is not None:
         source = load(UnitConfig, options.config, os.environ, ENVIRONMENT_PREFIX, {}).source
         if isinstance(source, SimulatedSourceConfig):
-            asyncio.run(_look_once(SimulatedSource(source)))
+            asyncio.run(_read_one_frame(SimulatedSource(source)))
     # Hulls belong to a cell and lie beside a unit's own kernels; a release has none.
     shutil.rmtree(folder_beside(HULLS), ignore_errors=True)
     print(f"{folder}: {len(list(folder.rglob('*.nbi')))} kernels for {target.name}")
     return 0
 
 
-async def _look_once(source: DepthSource) -> None:
+async def _read_one_frame(source: DepthSource) -> None:
     await source.open()
     try:
         async with aclosing(source.frames()) as frames:
@@ -154,7 +154,7 @@ async def _look_once(source: DepthSource) -> None:
         await source.close()
 
 
-async def _until_told_to_stop(unit: Unit) -> None:
+async def _run_until_stopped(unit: Unit) -> None:
     """Run to the end, or to a signal, and notify the service manager."""
     task = asyncio.ensure_future(unit.run())
     manager = ServiceManager()

@@ -53,20 +53,20 @@ class Capture:
         """Capture until stopped. Each failure is reported over the link."""
         threading.Thread(target=self._listen, name="link", daemon=True).start()
         try:
-            self._tell(link.Phase("waiting"))
+            self._send(link.Phase("waiting"))
             device = self._wait_for_device()
             if device is not None:
                 if self._request.reset:
-                    self._tell(link.Phase("resetting"))
+                    self._send(link.Phase("resetting"))
                     device = self._devices.reset(device)
-                self._tell(link.Phase("starting"))
+                self._send(link.Phase("starting"))
                 self._stream(SdkStream(device, self._request))
         except SourceEnded:
-            self._tell(link.Ended())
+            self._send(link.Ended())
         except RecordingBroken as error:
-            self._tell(link.Failed(str(error), final=True))
+            self._send(link.Failed(str(error), final=True))
         except SourceError as error:
-            self._tell(link.Failed(str(error), unplugged=isinstance(error, Unplugged)))
+            self._send(link.Failed(str(error), unplugged=isinstance(error, Unplugged)))
 
     def _wait_for_device(self) -> Any:
         """Return the device, or None if it is no longer needed."""
@@ -76,7 +76,7 @@ class Capture:
             if device is not None:
                 return device
             if reason != told:
-                self._tell(link.Phase("waiting", reason))
+                self._send(link.Phase("waiting", reason))
                 told = reason
             self._alive()
             self._devices.wait()
@@ -138,7 +138,7 @@ class Capture:
             self._told_ns = monotonic_ns()
             link.offer(self._end, link.Alive())
 
-    def _tell(self, message: link.Message) -> None:
+    def _send(self, message: link.Message) -> None:
         link.send(self._end, message)
 
     def _listen(self) -> None:

@@ -75,7 +75,7 @@ class CaptureSession:
                     raise SourceError(f"the capture process cannot be started: {error}") from error
                 raise
         session = cls(process, ours)
-        session.tell(request)
+        session.send(request)
         return session
 
     @property
@@ -83,7 +83,7 @@ class CaptureSession:
         """The id of the process."""
         return self._process.pid
 
-    def tell(self, message: link.Message) -> None:
+    def send(self, message: link.Message) -> None:
         """Send it a message; a process that cannot receive is gone."""
         with suppress(OSError):
             link.offer(self._end, message)
@@ -99,7 +99,7 @@ class CaptureSession:
 
     async def stop(self) -> None:
         """Stop it in good order, and make sure that it ends."""
-        self.tell(link.Stop())
+        self.send(link.Stop())
         await within(STOP_S, self._process.wait())
         await self.kill()
 

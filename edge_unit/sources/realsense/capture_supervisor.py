@@ -197,8 +197,8 @@ class CaptureSupervisor:
                         return None
                     if isinstance(message, link.Failed):
                         return message
-                    self._hear(message, session, now_ns)
-                self._look_for_frames(now_ns)
+                    self._receive(message, session, now_ns)
+                self._check_for_frame(now_ns)
                 if session.gone:
                     return link.Failed(f"the capture process was ended by {await session.ended()}")
                 if not late:
@@ -212,14 +212,14 @@ class CaptureSupervisor:
             self._session = None
             await session.kill()
 
-    def _hear(self, message: link.Message, session: CaptureSession, now_ns: int) -> None:
+    def _receive(self, message: link.Message, session: CaptureSession, now_ns: int) -> None:
         if isinstance(message, link.Opened):
             self._watchdog.stream(now_ns, message.fps)
             self._accept(message)
             self._frames = session.frames
             self._newest = 0
         elif isinstance(message, link.Phase):
-            self._watchdog.hear(now_ns, message.name)
+            self._watchdog.note_message(now_ns, message.name)
             if message.name == "waiting" and message.reason:
                 self._board.post("absent", message.reason)
             elif message.name == "resetting":
@@ -227,7 +227,7 @@ class CaptureSupervisor:
             elif message.name == "starting":
                 self._board.post("starting", "the camera is being started")
         else:
-            self._watchdog.hear(now_ns)
+            self._watchdog.note_message(now_ns)
 
     def _accept(self, opened: link.Opened) -> None:
         """Accept a stream that equals the one opened first, or refuse it.
@@ -242,7 +242,7 @@ class CaptureSupervisor:
         self.opened = opened
         self._known.set()
 
-    def _look_for_frames(self, now_ns: int) -> None:
+    def _check_for_frame(self, now_ns: int) -> None:
         """Check for a new frame; its message may have been lost."""
         frames, opened = self._frames, self.opened
         if frames is None or opened is None or self._watchdog.phase != "streaming":
@@ -267,7 +267,7 @@ class CaptureSupervisor:
 
     def _acknowledge(self) -> None:
         if self._request.lockstep and self._session is not None:
-            self._session.tell(link.Taken(self.last_number))
+            self._session.send(link.Taken(self.last_number))
 
 
 def _identity(opened: link.Opened) -> link.Opened:

@@ -58,20 +58,20 @@ class Watchdog:
         """Record the start of a new process."""
         self.phase, self._heard_ns, self._streaming_ns = "booting", now_ns, None
 
-    def hear(self, now_ns: int, phase: PhaseName | None = None) -> None:
+    def note_message(self, now_ns: int, phase: PhaseName | None = None) -> None:
         """Record a message of the process; `phase` if it reported one."""
         self._heard_ns = now_ns
         self.phase = phase or self.phase
 
     def stream(self, now_ns: int, fps: int) -> None:
         """Expect frames from now on, so many a second."""
-        self.hear(now_ns, "streaming")
+        self.note_message(now_ns, "streaming")
         self._streaming_ns = self._frame_ns = now_ns
         self._period_ns = NS_PER_S // max(fps, 1)
 
     def frame(self, now_ns: int) -> None:
         """Record a frame."""
-        self.hear(now_ns)
+        self.note_message(now_ns)
         self._frame_ns = now_ns
 
     def stuck_s(self, now_ns: int) -> float | None:

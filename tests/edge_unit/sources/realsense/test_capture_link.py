@@ -100,7 +100,7 @@ async def test_how_a_process_ended_is_told(script: str, how: str) -> None:
             break
     assert how in await session.ended()
     # There is nobody to hear it, and that is no error.
-    session.tell(link.Stop())
+    session.send(link.Stop())
 
 
 async def test_a_process_that_does_not_stop_is_killed() -> None:

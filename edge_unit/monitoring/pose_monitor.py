@@ -102,21 +102,21 @@ class _Fit:
     beyond_share: float
 
     @classmethod
-    def of(cls, looks: Iterable[Misfit]) -> _Fit:
+    def of(cls, checks: Iterable[Misfit]) -> _Fit:
         fit = _NOTHING
-        for look in looks:
-            fit = fit.with_look(look)
+        for check in checks:
+            fit = fit.with_check(check)
         return fit
 
-    def with_look(self, look: Misfit) -> _Fit:
+    def with_check(self, check: Misfit) -> _Fit:
         """Return the mean with one more check."""
         share = 1.0 / (self.looks + 1)
         return _Fit(
             self.looks + 1,
-            self.slope + share * (look.slope - self.slope),
-            self.curvature + share * (look.curvature - self.curvature),
-            self.valid_share + share * (look.valid_share - self.valid_share),
-            self.beyond_share + share * (look.beyond_share - self.beyond_share),
+            self.slope + share * (check.slope - self.slope),
+            self.curvature + share * (check.curvature - self.curvature),
+            self.valid_share + share * (check.valid_share - self.valid_share),
+            self.beyond_share + share * (check.beyond_share - self.beyond_share),
         )
 
 
@@ -133,7 +133,7 @@ class PoseMonitor:
         self._unsaved: dict[str, Any] | None = None
         self._place = ""
         self._layer = -1
-        self._looks: deque[Misfit] = deque(maxlen=WINDOW)
+        self._checks: deque[Misfit] = deque(maxlen=WINDOW)
         self._gathered = _NOTHING
         self._usual: _Fit | None = None
         self._due_ns = 0
@@ -144,7 +144,7 @@ class PoseMonitor:
         if place == self._place:
             return
         self._place, self._layer = place, -1
-        self._looks.clear()
+        self._checks.clear()
         self._gathered = _NOTHING
         self._usual = (self._old_file if self._is_old else self._file).load(self._fit_of)
         self._verdict = Verdict()
@@ -159,11 +159,11 @@ class PoseMonitor:
         if layer != self._layer:
             # The usual fit must be found anew; until then the old one is used.
             self._layer = layer
-            self._looks.clear()
+            self._checks.clear()
             self._gathered = _NOTHING
-        self._looks.append(misfit)
-        if len(self._looks) == WINDOW:
-            self._verdict = self._judged(_Fit.of(self._looks), misfit.static_share >= STATIC_SHARE_MIN)
+        self._checks.append(misfit)
+        if len(self._checks) == WINDOW:
+            self._verdict = self._judged(_Fit.of(self._checks), misfit.static_share >= STATIC_SHARE_MIN)
         if not self._verdict.reason:
             self._gather(misfit)
         else:
@@ -196,11 +196,11 @@ class PoseMonitor:
             self._file.save(document)
             self._is_old = False
 
-    def _gather(self, look: Misfit) -> None:
+    def _gather(self, check: Misfit) -> None:
         """Learn the usual fit; it is due to be stored whenever it rests on twice as many checks."""
         if self._gathered.looks == BASELINE_LOOKS_MAX:
             return
-        self._gathered = fit = self._gathered.with_look(look)
+        self._gathered = fit = self._gathered.with_check(check)
         if fit.looks >= BASELINE_LOOKS:
             self._usual = fit
             if fit.looks % BASELINE_LOOKS == 0 and (fit.looks // BASELINE_LOOKS).bit_count() == 1:

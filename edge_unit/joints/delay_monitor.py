@@ -39,7 +39,7 @@ class _Comparisons:
     """Comparisons of frames with the same static surfaces: the data of the thread, and nothing else."""
 
     def __init__(self, comparison: DelayComparison) -> None:
-        self.comparison = look
+        self.comparison = comparison
         self.estimate: DelayEstimate | None = None
         self._misfits: deque[NDArray[np.float64]] = deque(maxlen=LOOKS_MAX)
 

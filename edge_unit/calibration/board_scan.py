@@ -55,7 +55,7 @@ class BoardSearch:
         """Search at once, and with short pauses again."""
         self._next_ns, self._retry_s = 0, RETRY_MIN_S
 
-    async def look(self, board: Board, tell: Callable[[str], None]) -> Localisation:
+    async def scan(self, board: Board, tell: Callable[[str], None]) -> Localisation:
         """Take images until they give the pose, or will not; `tell` receives the progress meanwhile.
 
         Raises:

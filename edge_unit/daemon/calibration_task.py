@@ -28,7 +28,7 @@ async def localise(search: BoardSearch, uplink: Uplink, assignment: Assignment, 
 
     first = not search.outcome
     try:
-        found = await search.look(require_board(assignment.cell.board), tell)
+        found = await search.scan(require_board(assignment.cell.board), tell)
         quality = PoseQuality(
             uncertainty_mm=round(found.uncertainty_mm, 3),
             uncertainty_deg=round(found.uncertainty_deg, 4),

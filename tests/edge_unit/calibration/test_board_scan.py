@@ -65,7 +65,7 @@ def board_picture() -> NDArray[np.uint8]:
 async def test_it_looks_until_it_has_enough() -> None:
     source, told = Pictures(board_picture(), EMPTY), list[str]()
     search = BoardSearch(source, "infrared")
-    found = await search.look(BOARD, told.append)
+    found = await search.scan(BOARD, told.append)
     assert np.abs(found.T_world_camera - inverse(T_CAMERA_BOARD)).max() < 2e-3
     assert found.frames_used == GOOD_FRAMES
     assert told[:2] == ["looking for the board: 12 of 12 markers", "looking for the board: 0 of 12 markers"]
@@ -75,7 +75,7 @@ async def test_it_looks_until_it_has_enough() -> None:
 
 async def test_a_pose_that_is_not_known_well_takes_more_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("edge_unit.calibration.board_scan.GOOD_MM", 0.0)
-    found = await BoardSearch(Pictures(board_picture()), "infrared").look(BOARD, lambda seen: None)
+    found = await BoardSearch(Pictures(board_picture()), "infrared").scan(BOARD, lambda seen: None)
     assert found.frames_used == FRAMES
 
 
@@ -84,13 +84,13 @@ async def test_without_a_board_it_looks_ever_less_often() -> None:
     search = BoardSearch(source, "infrared")
     assert search.due(monotonic_ns())
     with pytest.raises(BoardError, match="none of the board's 12 markers"):
-        await search.look(BOARD, lambda seen: None)
+        await search.scan(BOARD, lambda seen: None)
     assert source.taken == EMPTY_FRAMES - 1
     after_ns = monotonic_ns()
     assert not search.due(after_ns)
     assert search.due(after_ns + round(RETRY_MIN_S * 1e9))
     with pytest.raises(BoardError):
-        await search.look(BOARD, lambda seen: None)
+        await search.scan(BOARD, lambda seen: None)
     assert not search.due(monotonic_ns() + round(1.5 * RETRY_MIN_S * 1e9))
     assert "none of the board's" in search.outcome
     search.begin_anew()
@@ -101,9 +101,9 @@ async def test_a_source_without_pictures() -> None:
     search = BoardSearch(object(), "infrared")
     assert not search.due(monotonic_ns())
     with pytest.raises(BoardError, match="no images"):
-        await search.look(BOARD, lambda seen: None)
+        await search.scan(BOARD, lambda seen: None)
     with pytest.raises(SourceError, match="no picture"):
-        await BoardSearch(Pictures(), "infrared").look(BOARD, lambda seen: None)
+        await BoardSearch(Pictures(), "infrared").scan(BOARD, lambda seen: None)
 
 
 @pytest.mark.parametrize("stream", ["infrared", "color"])
@@ -113,7 +113,7 @@ async def test_a_simulated_camera_finds_its_pose_by_the_demo_cells_board(stream:
         camera = await source.open()
         assert camera.T_world_camera is None
         assert demo.board is not None
-        found = await BoardSearch(source, stream).look(demo.board, lambda seen: None)
+        found = await BoardSearch(source, stream).scan(demo.board, lambda seen: None)
     finally:
         await source.close()
     off = inverse(rig(demo, 4)[1]) @ found.T_world_camera

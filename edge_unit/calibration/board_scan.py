@@ -68,13 +68,13 @@ class BoardSearch:
             raise BoardError("this unit's source has no images in which to look for the board")
         begun_ns = monotonic_ns()
         try:
-            async with source.look(self._stream) as look:
-                info = look.info
+            async with source.open_images(self._stream) as feed:
+                info = feed.info
                 localiser = BoardLocaliser(
                     board, info.intrinsics, info.distortion, info.T_depth_image, info.distortion_model
                 )
                 seen, empty = 0, 0
-                async with aclosing(look.images()) as images:
+                async with aclosing(feed.images()) as images:
                     async for image in images:
                         sighting = await asyncio.to_thread(localiser.add, image.pixels.copy())
                         tell(f"looking for the board: {localiser.now}")

@@ -66,7 +66,7 @@ class ImageFeed(Protocol):
 class ImageSource(Protocol):
     """A source that can deliver images of another stream, with the emitter off, within the context."""
 
-    def look(self, stream: ImageStream) -> AbstractAsyncContextManager[ImageFeed]:
+    def open_images(self, stream: ImageStream) -> AbstractAsyncContextManager[ImageFeed]:
         """Pause depth and deliver images; depth resumes at the end of the context.
 
         Raises:

@@ -152,7 +152,7 @@ class SimulatedSource:
             yield DepthFrame(frame.depth, due_ns, number)
 
     @asynccontextmanager
-    async def look(self, stream: ImageStream) -> AsyncIterator[SimulatedImages]:
+    async def open_images(self, stream: ImageStream) -> AsyncIterator[SimulatedImages]:
         """See `ImageSource`."""
         worker = self._worker
         if worker is None:

@@ -178,7 +178,7 @@ class RealsenseSource:
     # ------------------------------------------------------------------ the calibration board
 
     @asynccontextmanager
-    async def look(self, stream: ImageStream) -> AsyncIterator[RealsenseImages]:
+    async def open_images(self, stream: ImageStream) -> AsyncIterator[RealsenseImages]:
         """Deliver images of another stream, with the emitter off; depth is paused, and resumes afterwards.
 
         Raises:

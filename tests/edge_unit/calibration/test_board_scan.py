@@ -39,7 +39,7 @@ class Pictures:
         self.looking = False
 
     @asynccontextmanager
-    async def look(self, stream: ImageStream) -> AsyncIterator[Pictures]:
+    async def open_images(self, stream: ImageStream) -> AsyncIterator[Pictures]:
         self.looking = True
         try:
             yield self

@@ -695,7 +695,7 @@ class LookingSource(FakeSource):
         self.looks = 0
 
     @contextlib.asynccontextmanager
-    async def look(self, stream: ImageStream) -> AsyncIterator[LookingSource]:
+    async def open_images(self, stream: ImageStream) -> AsyncIterator[LookingSource]:
         self.looks += 1
         yield self
 

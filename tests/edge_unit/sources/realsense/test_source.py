@@ -326,22 +326,22 @@ async def test_a_look_at_the_board_and_depth_goes_on(recording: Path) -> None:
     async with opened(recording=recording, real_time=False) as (source, info):
         frames = source.frames()
         first = [(await anext(frames)).frame_number for _ in range(3)]
-        async with source.look("color") as look:
+        async with source.open_images("color") as feed:
             assert source.status.state == "looking" or source.status.state == "starting"
-            assert look.info.intrinsics.fx == info.intrinsics.fx
-            assert look.info.distortion == (0.0,) * 5
-            np.testing.assert_allclose(look.info.T_depth_image[:3, 3], recordings.COLOR_AT_M, atol=1e-7)
-            np.testing.assert_allclose(look.info.T_depth_image[:3, :3], np.eye(3))
-            images = look.images()
+            assert feed.info.intrinsics.fx == info.intrinsics.fx
+            assert feed.info.distortion == (0.0,) * 5
+            np.testing.assert_allclose(feed.info.T_depth_image[:3, 3], recordings.COLOR_AT_M, atol=1e-7)
+            np.testing.assert_allclose(feed.info.T_depth_image[:3, :3], np.eye(3))
+            images = feed.images()
             for _ in range(2):
                 image = await anext(images)
                 assert image.pixels.shape == (recordings.HEIGHT, recordings.WIDTH, 3)
                 assert (image.pixels == image.frame_number).all()
-        async with source.look("infrared") as look:
-            image = await anext(look.images())
+        async with source.open_images("infrared") as feed:
+            image = await anext(feed.images())
             assert image.pixels.shape == (recordings.HEIGHT, recordings.WIDTH)
             assert (image.pixels == image.frame_number).all()
-            np.testing.assert_allclose(look.info.T_depth_image, np.eye(4))
+            np.testing.assert_allclose(feed.info.T_depth_image, np.eye(4))
         rest = [frame.frame_number async for frame in frames]
         assert first + rest == list(range(1, FRAMES + 1))
 
@@ -349,7 +349,7 @@ async def test_a_look_at_the_board_and_depth_goes_on(recording: Path) -> None:
 async def test_a_stream_that_is_not_there_is_named_and_depth_goes_on(other: Path) -> None:
     async with opened(recording=other, loop=True) as (source, _):
         with pytest.raises(SourceError, match=r"other\.db3: no color stream \(rgb8\) was recorded"):
-            async with source.look("color"):
+            async with source.open_images("color"):
                 pass
         await until(source, lambda status: status.state == "live")
 

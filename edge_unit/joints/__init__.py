@@ -9,7 +9,7 @@ In the order of the flow:
     delay_monitor         the same while a unit runs, as a warning
 """
 
-from edge_unit.joints.delay_estimation import DelayComparison, DelayEstimate, estimate_delay, look_at
+from edge_unit.joints.delay_estimation import DelayComparison, DelayEstimate, compare_frame, estimate_delay
 from edge_unit.joints.delay_from_recording import delay_of_recording
 from edge_unit.joints.delay_monitor import DelayMonitor
 from edge_unit.joints.history import JointEstimate, JointHistory
@@ -20,7 +20,7 @@ __all__ = [
     "DelayMonitor",
     "JointEstimate",
     "JointHistory",
+    "compare_frame",
     "delay_of_recording",
     "estimate_delay",
-    "look_at",
 ]

@@ -136,8 +136,8 @@ def estimate_delay(misfits: Collection[NDArray[np.float64]]) -> DelayEstimate:
             f"joint delay: the robot hardly moved: {len(misfits)} frames with motion of {MOTION_MIN_M / MOTION_SPAN_S} "
             f"m/s and more in view, expected at least {LOOKS_MIN}"
         )
-    looks = np.array(misfits)
-    sums = np.array([looks[group::GROUPS].sum(axis=0) for group in range(GROUPS)])
+    frames = np.array(misfits)
+    sums = np.array([frames[group::GROUPS].sum(axis=0) for group in range(GROUPS)])
     whole = sums.sum(axis=0)
     delay_s = _best(whole)
     without_s = np.array([_best(whole - part) for part in sums])
@@ -160,8 +160,8 @@ def _best(curve: NDArray[np.float64]) -> float:
     return lowest - 0.5 * float(slope / square)
 
 
-def look_at(
-    look: DelayComparison,
+def compare_frame(
+    comparison: DelayComparison,
     depth: NDArray[np.uint16],
     captured_s: float,
     joints_at: Callable[[float], NDArray[np.float64] | None],
@@ -172,6 +172,6 @@ def look_at(
     """
     offsets_s = (-0.5 * MOTION_SPAN_S, 0.5 * MOTION_SPAN_S, *DELAYS_S.tolist())
     joints = [each for offset_s in offsets_s if (each := joints_at(captured_s + offset_s)) is not None]
-    if len(joints) < len(offsets_s) or not look.moves(joints[0], joints[1]):
+    if len(joints) < len(offsets_s) or not comparison.moves(joints[0], joints[1]):
         return None
-    return look.misfits(look.thinned(depth), joints[2:])
+    return comparison.misfits(comparison.thinned(depth), joints[2:])

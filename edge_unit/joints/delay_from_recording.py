@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_unit.joints.delay_estimation import DelayComparison, DelayEstimate, estimate_delay, look_at
+from edge_unit.joints.delay_estimation import DelayComparison, DelayEstimate, compare_frame, estimate_delay
 from edge_unit.joints.history import EXTRAPOLATION_MAX_S
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
@@ -51,11 +51,11 @@ async def _delay(config: RecordedSourceConfig, cell: Cell) -> DelayEstimate:
         raise InputError(f"{config.folder / config.pose}: expected the camera's pose, there is no such file")
     settings = FilterSettings()
     static_m = DepthPipeline(info.intrinsics, info.T_world_camera, cell, settings).expected_depth(None)
-    look = DelayComparison(info.intrinsics, info.T_world_camera, robot, static_m, settings)
+    comparison = DelayComparison(info.intrinsics, info.T_world_camera, robot, static_m, settings)
     found, count = [], 0
     async for frame in source.frames():
         if count < len(times_s):
-            misfits = look_at(look, frame.depth, float(times_s[count]), samples.at)
+            misfits = compare_frame(comparison, frame.depth, float(times_s[count]), samples.at)
             found += [] if misfits is None else [misfits]
         count += 1
     if count != len(times_s):

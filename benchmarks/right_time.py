@@ -25,8 +25,7 @@ from benchmarks.joint_delivery import Delivered, Delivery
 from benchmarks.reporting.report import RESULTS, Mark, Result, line, write
 from benchmarks.sweep_scenes.stage import reported_at
 from benchmarks.sweeps import runner
-from edge_unit.joints import DelayComparison, DelayEstimate, JointEstimate, estimate_delay
-from edge_unit.joints import look_at as look_at_frame
+from edge_unit.joints import DelayComparison, DelayEstimate, JointEstimate, compare_frame, estimate_delay
 from edge_unit.joints.delay_monitor import LOOKS_MAX
 from edge_unit.pipeline import DepthPipeline, Voxels
 from shared.camera import Intrinsics
@@ -290,7 +289,7 @@ def find_delays(name: str, at_corner: bool, looks: int, intrinsics: Intrinsics) 
     found = []
     for delay_s in DELAYS_S:
         late = partial(_late, path, delay_s)
-        misfits = [each for depth, t_s in frames if (each := look_at_frame(look, depth, t_s, late)) is not None]
+        misfits = [each for depth, t_s in frames if (each := compare_frame(look, depth, t_s, late)) is not None]
         found.append(DelayFound(name, "at a corner" if at_corner else "near", delay_s, estimate_delay(misfits)))
     return found
 

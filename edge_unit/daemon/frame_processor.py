@@ -124,9 +124,9 @@ class FrameProcessor:
         """Yield the work that follows a processed frame, to run on the event loop beside the next frames."""
         pipeline = self.assigned.pipeline
         if pipeline is not None and joints is not None and report.health.trouble is None:
-            look = self.joints.watch_delay(pipeline, frame)
-            if look is not None:
-                yield asyncio.to_thread(look)
+            comparison = self.joints.watch_delay(pipeline, frame)
+            if comparison is not None:
+                yield asyncio.to_thread(comparison)
         if self._monitor.unsaved:
             yield asyncio.to_thread(self._monitor.save)
         gathered = self._refining.take()

@@ -48,10 +48,10 @@ class FrameJoints:
         if frame.joints is not None or not clock.known:
             return None
         at_ns = frame.captured_at_ns + clock.offset_ns
-        look = self._delay.next_comparison(self._uplink.joints)
+        comparison = self._delay.next_comparison(self._uplink.joints)
         if self._delay.due(at_ns):
             self._delay.keep(pipeline, frame.depth, at_ns)
-        return look
+        return comparison
 
     def warning(self, joint_delay_s: float) -> str | None:
         """Return the value to set instead of `joint_delay_s` if that is clearly wrong, else None."""

@@ -93,7 +93,7 @@ class DepthPipeline:
         stages = StageRunner()
         robot = stages.run("expected", self._moving.place, joints, joint_uncertainty_rad)
         voxels = self._voxelizer.voxels(depth_raw, known.room_raw, known.minimum_raw, robot, self._static.halo, stages)
-        seen = stages.run("seen", self._visibility.look, depth_raw, known.seen_limit_raw, robot.near_raw)
+        seen = stages.run("seen", self._visibility.find_seen, depth_raw, known.seen_limit_raw, robot.near_raw)
         health = stages.run("health", self._health.check, depth_raw, known.depth_raw, robot.near_raw, settings)
         misfit = None
         if with_misfit:

@@ -103,7 +103,7 @@ class Visibility:
             plain(blocks), inverse(T_world_camera), camera_of(camera), plain(measuring), self._views
         )
 
-    def look(
+    def find_seen(
         self,
         depth_raw: NDArray[np.uint16],
         static_limit_raw: NDArray[np.uint16],

@@ -19,9 +19,9 @@ from edge_unit.joints import (
     DelayEstimate,
     DelayMonitor,
     JointHistory,
+    compare_frame,
     delay_monitor,
     estimate_delay,
-    look_at,
 )
 from edge_unit.joints.delay_estimation import LOOKS_MIN
 from edge_unit.joints.delay_from_recording import JointSamples
@@ -66,8 +66,10 @@ def looks(
 ) -> list[NDArray[np.float64]]:
     robot = pipeline.cell.robot
     assert robot is not None
-    look = DelayComparison(INTRINSICS, POSE, robot, pipeline.expected_depth(None), FilterSettings())
-    found = [look_at(look, depth, t_s, lambda at_s: path.joints_at(at_s - delay_s)) for depth, t_s in frames]
+    comparison = DelayComparison(INTRINSICS, POSE, robot, pipeline.expected_depth(None), FilterSettings())
+    found = [
+        compare_frame(comparison, depth, t_s, lambda at_s: path.joints_at(at_s - delay_s)) for depth, t_s in frames
+    ]
     return [misfits for misfits in found if misfits is not None]
 
 
@@ -161,7 +163,7 @@ def test_a_frame_that_is_kept_is_a_copy(pipeline: DepthPipeline, frames: list[Fr
     robot = pipeline.cell.robot
     assert robot is not None
     static_m = pipeline.expected_depth(None)
-    look = DelayComparison(INTRINSICS, POSE, robot, static_m, FilterSettings())
+    comparison = DelayComparison(INTRINSICS, POSE, robot, static_m, FilterSettings())
     joints = [PATH.joints_at(frame_s)]
     before = depth.copy()
     thinned_m = look.thinned(before)

@@ -18,7 +18,7 @@ FAR = np.full(CAMERA.shape, 65535, np.uint16)
 
 
 def look(depth: NDArray[np.uint16], limit: NDArray[np.uint16] = FAR, robot: NDArray[np.uint16] = FAR) -> SeenBlocks:
-    return Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.9, 0.0).look(depth, limit, robot)
+    return Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.9, 0.0).find_seen(depth, limit, robot)
 
 
 def depth_of(blocks: SeenBlocks) -> NDArray[np.float64]:
@@ -79,18 +79,18 @@ def test_nothing_is_seen_through_what_hides_it(image: str) -> None:
 
 def test_a_report_is_not_overwritten_by_the_next() -> None:
     visibility = Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.9, 0.0)
-    first = visibility.look(FAR, FAR, FAR)
+    first = visibility.find_seen(FAR, FAR, FAR)
     number = first.seen.sum()
-    visibility.look(np.zeros_like(FAR), FAR, FAR)
+    visibility.find_seen(np.zeros_like(FAR), FAR, FAR)
     assert first.seen.sum() == number > 0
 
 
 def test_a_camera_that_moved_looks_elsewhere() -> None:
     visibility = Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.9, 0.0)
     visibility.place(look_at((0, 0, 1.7), (0, 0, 5.0)))
-    assert not visibility.look(FAR, FAR, FAR).seen.any()
+    assert not visibility.find_seen(FAR, FAR, FAR).seen.any()
     visibility.place(ABOVE)
-    assert (visibility.look(FAR, FAR, FAR).seen == look(FAR).seen).all()
+    assert (visibility.find_seen(FAR, FAR, FAR).seen == look(FAR).seen).all()
 
 
 def test_packed_bits_start_with_the_first_block_in_the_lowest_bit() -> None:

@@ -109,9 +109,9 @@ def test_a_running_unit_warns_of_a_delay_that_is_off(pipeline: DepthPipeline, fr
             t_s = frame_s * slow + 0.008 * step - 0.1
             late_ns = began_ns + round((t_s + 0.06) * NS_PER_S)
             history.add([JointSample(late_ns, tuple(path.joints_at(t_s).tolist()), None)])
-        look = watch.next_comparison(history)
-        if look is not None:
-            look()
+        comparison = watch.next_comparison(history)
+        if comparison is not None:
+            comparison()
         told.append(watch.warning(0.0))
     assert told[: LOOKS_MIN - 1] == [None] * (LOOKS_MIN - 1)
     assert told[-1] is not None
@@ -158,7 +158,7 @@ def test_looks_come_one_by_one_and_those_of_another_background_do_not_count(
 
 
 def test_a_frame_that_is_kept_is_a_copy(pipeline: DepthPipeline, frames: list[Frame]) -> None:
-    """The source uses its memory again, and the pipeline goes on while the look is taken."""
+    """The source uses its memory again, and the pipeline goes on during the comparison."""
     depth, frame_s = frames[3]
     robot = pipeline.cell.robot
     assert robot is not None
@@ -166,11 +166,11 @@ def test_a_frame_that_is_kept_is_a_copy(pipeline: DepthPipeline, frames: list[Fr
     comparison = DelayComparison(INTRINSICS, POSE, robot, static_m, FilterSettings())
     joints = [PATH.joints_at(frame_s)]
     before = depth.copy()
-    thinned_m = look.thinned(before)
-    expected = look.misfits(thinned_m, joints)
+    thinned_m = comparison.thinned(before)
+    expected = comparison.misfits(thinned_m, joints)
     before[:] = 0
     static_m[:] = 0.0
-    np.testing.assert_array_equal(look.misfits(thinned_m, joints), expected)
+    np.testing.assert_array_equal(comparison.misfits(thinned_m, joints), expected)
 
 
 def test_a_recording_tells_its_delay(frames: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -128,7 +128,7 @@ async def test_a_server_of_an_older_tls_gets_nothing(ours: trustme.CA, ca_file: 
     assert not old.received
 
 
-def test_a_master_without_tls_is_refused_where_its_certificate_is_to_be_checked(ca_file: Path) -> None:
+def test_a_master_without_tls_is_refused_if_its_certificate_must_be_checked(ca_file: Path) -> None:
     with pytest.raises(ConfigError, match="master_url: expected https"):
         MasterClient("http://127.0.0.1:1", lambda: TOKEN, tls=tls_context(ca_file))
 

@@ -70,7 +70,7 @@ def printed(pdf: Path) -> tuple[NDArray[np.float64], tuple[float, float], str]:
 
 
 @pytest.mark.parametrize("board", [layout(), layout("charuco", 0.047, 0.0351, 4)], ids=["grid", "charuco"])
-def test_what_is_printed_is_what_cameras_look_for(board: BoardLayout, tmp_path: Path) -> None:
+def test_a_printed_board_is_detected(board: BoardLayout, tmp_path: Path) -> None:
     pdf = tmp_path / "board.pdf"
     assert main(["board", "--cell", str(cell_file(tmp_path, board.board)), "--out", str(pdf), "--page", "A3"]) == 0
     black_mm, (width_mm, height_mm), text = printed(pdf)

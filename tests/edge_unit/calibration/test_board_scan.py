@@ -62,7 +62,7 @@ def board_picture() -> NDArray[np.uint8]:
     return picture.develop(picture.expose(T_CAMERA_BOARD), np.random.default_rng(0))
 
 
-async def test_it_looks_until_it_has_enough() -> None:
+async def test_it_scans_until_it_has_enough_images() -> None:
     source, told = Pictures(board_picture(), EMPTY), list[str]()
     search = BoardSearch(source, "infrared")
     found = await search.scan(BOARD, told.append)
@@ -73,13 +73,13 @@ async def test_it_looks_until_it_has_enough() -> None:
     assert search.outcome == ""
 
 
-async def test_a_pose_that_is_not_known_well_takes_more_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_uncertain_pose_takes_more_images(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("edge_unit.calibration.board_scan.GOOD_MM", 0.0)
     found = await BoardSearch(Pictures(board_picture()), "infrared").scan(BOARD, lambda seen: None)
     assert found.frames_used == FRAMES
 
 
-async def test_without_a_board_it_looks_ever_less_often() -> None:
+async def test_without_a_board_it_scans_with_growing_pauses() -> None:
     source = Pictures(EMPTY)
     search = BoardSearch(source, "infrared")
     assert search.due(monotonic_ns())
@@ -97,7 +97,7 @@ async def test_without_a_board_it_looks_ever_less_often() -> None:
     assert search.due(0)
 
 
-async def test_a_source_without_pictures() -> None:
+async def test_a_source_without_images() -> None:
     search = BoardSearch(object(), "infrared")
     assert not search.due(monotonic_ns())
     with pytest.raises(BoardError, match="no images"):
@@ -121,7 +121,7 @@ async def test_a_simulated_camera_finds_its_pose_by_the_demo_cells_board(stream:
     assert np.degrees(angle_rad(off)) < 0.3
 
 
-def test_what_stands_before_the_board_hides_it() -> None:
+def test_an_object_before_the_board_hides_it() -> None:
     world = World.demo(people=0)
     camera = BoardCamera(world, rig(world.cell, 4)[3], "infrared", 0)
     assert camera.intrinsics.shape == camera.take(0.0).shape

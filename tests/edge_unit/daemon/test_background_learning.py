@@ -43,7 +43,7 @@ class Student:
         return self.learning.add(self.pipeline, PLACE, DEPTH, None)
 
 
-def test_what_was_learned_is_found_again_and_stays_dropped(tmp_path: Path) -> None:
+def test_a_learned_background_is_loaded_again_and_stays_dropped(tmp_path: Path) -> None:
     one = Student(tmp_path, frames=2)
     one.learning.find(one.pipeline, PLACE)
     assert one.learning.progress == (0, 2)
@@ -67,7 +67,7 @@ def test_what_was_learned_is_found_again_and_stays_dropped(tmp_path: Path) -> No
     assert last.add() is None
 
 
-def test_whoever_asked_is_told_what_became_of_it(tmp_path: Path) -> None:
+def test_each_command_gets_its_outcome(tmp_path: Path) -> None:
     one = Student(tmp_path, frames=1)
     one.learning.begin(one.pipeline, LEARN)
     one.learning.begin(one.pipeline, LEARN)

@@ -8,7 +8,7 @@ import asyncio
 from edge_unit.daemon.task_group import TaskGroup
 
 
-async def test_what_is_not_done_when_the_unit_ends_is_cancelled() -> None:
+async def test_unfinished_tasks_are_cancelled_at_the_end() -> None:
     tasks, done, cancelled = TaskGroup(), asyncio.Event(), asyncio.Event()
 
     async def short() -> None:

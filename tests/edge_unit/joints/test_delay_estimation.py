@@ -81,13 +81,13 @@ def test_the_delay_is_found_within_5_ms(pipeline: DepthPipeline, frames: list[Fr
     assert found.looks >= LOOKS_MIN
 
 
-def test_a_robot_that_hardly_moves_tells_nothing(pipeline: DepthPipeline, frames: list[Frame]) -> None:
+def test_a_robot_that_hardly_moves_gives_no_estimate(pipeline: DepthPipeline, frames: list[Frame]) -> None:
     assert looks(pipeline, frames, 0.0, RobotPath.still(PATH.joints_at(0.0))) == []
     with pytest.raises(InputError, match="hardly moved"):
         estimate_delay([])
 
 
-def test_a_delay_beyond_what_is_tried_is_refused(pipeline: DepthPipeline, frames: list[Frame]) -> None:
+def test_a_delay_beyond_the_tried_range_is_refused(pipeline: DepthPipeline, frames: list[Frame]) -> None:
     with pytest.raises(InputError, match="the same clock"):
         estimate_delay(looks(pipeline, frames, 0.24))
 
@@ -123,7 +123,7 @@ def test_a_running_unit_warns_of_a_delay_that_is_off(pipeline: DepthPipeline, fr
     assert len(told[-1]) < 200
 
 
-def test_looks_come_one_by_one_and_those_of_another_background_do_not_count(
+def test_comparisons_run_one_by_one_and_those_of_another_background_do_not_count(
     world: World, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pipeline = DepthPipeline(INTRINSICS, POSE, world.cell)
@@ -173,7 +173,9 @@ def test_a_frame_that_is_kept_is_a_copy(pipeline: DepthPipeline, frames: list[Fr
     np.testing.assert_array_equal(comparison.misfits(thinned_m, joints), expected)
 
 
-def test_a_recording_tells_its_delay(frames: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_delay_of_a_recording_is_estimated(
+    frames: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "recording"
     (folder / "depth").mkdir(parents=True)
     for number, (depth, _) in enumerate(frames):
@@ -197,7 +199,7 @@ def test_a_recording_tells_its_delay(frames: list[Frame], tmp_path: Path, capsys
     assert "joint_samples.csv: expected rows of 7 finite numbers" in capsys.readouterr().err
 
 
-def test_samples_are_interpolated_where_they_are_dense() -> None:
+def test_dense_samples_are_interpolated() -> None:
     samples = JointSamples(np.array(((0.0, 1.0), (0.1, 2.0), (0.9, 3.0))), Path("samples.csv"))
     assert samples.at(0.05) == pytest.approx([1.5])
     assert samples.at(0.5) is None

@@ -51,7 +51,7 @@ def test_a_robot_at_rest_is_certain() -> None:
     assert found.uncertainty.tolist() == [0.0]
 
 
-def test_after_the_newest_it_goes_on_at_the_last_speed_and_tells_how_wrong_that_may_be() -> None:
+def test_after_the_newest_it_extrapolates_with_an_uncertainty() -> None:
     known = history(*((1000 + 8 * i, 0.008 * i) for i in range(10)))
     found = at(known, 1172)
     assert found.positions == pytest.approx([0.172])
@@ -124,7 +124,7 @@ def test_one_sample_alone_may_be_moving() -> None:
     assert known.at(1060 * MS, 0, STALE_S) is None
 
 
-def test_samples_too_far_apart_tell_nothing_of_between() -> None:
+def test_samples_too_far_apart_are_not_interpolated() -> None:
     """Else a robot that stood still would hide who stands beside it."""
     assert at(history((1000, 0.0), (1190, 0.0)), 1100).uncertainty[0] <= UNCERTAINTY_MAX
     apart = history((1000, 0.0), (1210, 0.0))
@@ -137,7 +137,7 @@ def test_a_joint_too_fast_for_its_time_is_not_known() -> None:
     assert fast.at(1005 * MS, 5 * MS, STALE_S) is None
 
 
-def test_what_is_known_already_is_passed_over() -> None:
+def test_known_samples_are_skipped() -> None:
     known = history((1000, 0.0), (1010, 0.1))
     known.add([JointSample(1005 * MS, (9.0,), None), JointSample(1010 * MS, (9.0,), None)])
     assert at(known, 1010).positions == pytest.approx([0.1])

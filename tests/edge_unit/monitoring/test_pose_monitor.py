@@ -72,7 +72,7 @@ KNOCKS = {
 
 
 @pytest.mark.parametrize("knock", KNOCKS)
-def test_a_knocked_camera_is_told_within_two_seconds_and_recovers(watched: Watched, knock: str) -> None:
+def test_a_knocked_camera_is_reported_within_two_seconds_and_recovers(watched: Watched, knock: str) -> None:
     reasons = [verdict.reason for verdict in watched.looks(WINDOW, KNOCKS[knock])]
     assert reasons[-1]
     assert PERIOD_S * WINDOW < 2.0
@@ -169,7 +169,7 @@ def misfit_of(watched: Watched) -> Misfit:
     return watched.misfit
 
 
-def test_looks_are_due_again_after_a_while_and_when_time_begins_anew(tmp_path: Path) -> None:
+def test_checks_are_due_after_a_period_and_after_a_clock_restart(tmp_path: Path) -> None:
     stance = PoseMonitor(tmp_path)
     look = Misfit(np.zeros(6), np.ones(6), 1.0, 0.0, 1.0)
     assert stance.due(10_000_000_000)

@@ -7,7 +7,7 @@ from edge_unit.monitoring import StageTimer
 from edge_unit.monitoring import stage_timer as module
 
 
-def test_stages_follow_one_another_and_parts_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stages_follow_one_another_and_parts_are_listed_separately(monkeypatch: pytest.MonkeyPatch) -> None:
     now_ns = iter((1_010, 1_050))
     monkeypatch.setattr(module, "monotonic_ns", lambda: next(now_ns))
     stages = StageTimer(1_000)

@@ -58,7 +58,7 @@ def pipeline(robot: bool = True) -> DepthPipeline:
     return DepthPipeline(CAMERA, OVERHEAD, small_cell(robot=robot, floor=False))
 
 
-def test_what_was_learned_is_no_obstacle_and_what_comes_after_is() -> None:
+def test_a_learned_surface_is_no_obstacle_and_a_new_one_is() -> None:
     empty = pipeline(robot=False)
     rng = np.random.default_rng(0)
     assert len(empty.process(look(), None).voxels) > 10
@@ -79,7 +79,7 @@ def test_the_expected_depth_is_the_learned_one() -> None:
     assert np.allclose(expected_m, look() / 1000.0, atol=1e-3)
 
 
-def test_who_crosses_while_it_learns_is_still_reported() -> None:
+def test_a_person_who_crosses_during_learning_is_still_reported() -> None:
     """He covers each pixel of his way for 5 of 60 frames."""
     empty = pipeline(robot=False)
     rng = np.random.default_rng(0)
@@ -97,7 +97,7 @@ def test_who_crosses_while_it_learns_is_still_reported() -> None:
     assert len(empty.process(look(noise=rng), None).voxels) == 0
 
 
-def test_who_crosses_where_nothing_is_measured_is_still_reported() -> None:
+def test_a_person_who_crosses_unmeasured_pixels_is_still_reported() -> None:
     empty = pipeline(robot=False)
 
     def frames() -> Iterator[tuple[Depth, None]]:

@@ -75,7 +75,7 @@ def what_it_is_given(joints: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("joints", [HOME_RAD, HOME_RAD.tolist(), None], ids=["array", "list", "none"])
 @pytest.mark.parametrize("block", blocks())
-def test_the_block_runs_as_it_stands(block: str, joints: Any) -> None:
+def test_the_block_runs_unchanged(block: str, joints: Any) -> None:
     names = what_it_is_given(joints)
     exec(compile(block, "contract", "exec"), names)
     voxels, pipeline, shape = names["voxels"], names["pipeline"], names["intrinsics"].shape

@@ -66,14 +66,14 @@ def look(
 # ---------------------------------------------------------------- what is known and what is not
 
 
-def test_what_is_known_is_no_obstacle() -> None:
+def test_a_known_surface_is_no_obstacle() -> None:
     rng = np.random.default_rng(0)
     watched = pipeline()
     for joints in np.linspace(-3.0, 3.0, 12):
         assert len(watched.process(look(joints=joints, noise=rng), [joints]).voxels) == 0
 
 
-def test_what_is_not_known_is_reported_where_it_stands() -> None:
+def test_an_unknown_object_is_reported_at_its_position() -> None:
     watched = pipeline()
     depth = look(PERSON)
     voxels = watched.process(depth, [0.3]).voxels
@@ -84,7 +84,7 @@ def test_what_is_not_known_is_reported_where_it_stands() -> None:
     assert 0.75 < centres_m[:, 2].max() < 0.85
 
 
-def test_foreground_is_what_process_counts() -> None:
+def test_foreground_agrees_with_process() -> None:
     watched = pipeline(occupancy_threshold=0.05, own_share_min=0.0, support_area_max_m2=1e-4)
     depth = look(PERSON)
     mask = watched.foreground(depth, [0.3])
@@ -135,7 +135,7 @@ def test_known_edges_have_a_halo_and_no_more() -> None:
 # ---------------------------------------------------------------- the robot
 
 
-def test_the_robot_is_filtered_wherever_it_is_and_reported_elsewhere() -> None:
+def test_the_robot_is_filtered_at_its_joints_and_reported_elsewhere() -> None:
     watched = pipeline()
     alone_m = raycast(bodies(small_cell(floor=False), [0.3])[1:], OVERHEAD, CAMERA)
     arm = shrunk(np.isfinite(alone_m) & (measured(alone_m, CAMERA) == look()), 3)
@@ -202,7 +202,7 @@ def test_joint_uncertainty_widens_the_robot() -> None:
     assert (known == watched.expected_depth([0.3])).all()
 
 
-def test_an_arm_that_is_not_where_it_should_be_is_covered_by_its_uncertainty() -> None:
+def test_a_misplaced_arm_is_covered_by_its_uncertainty() -> None:
     watched = pipeline()
     off_rad = 0.25
     depth = look(joints=0.3 + off_rad)
@@ -393,7 +393,7 @@ def test_another_cell() -> None:
 
 
 @pytest.mark.parametrize("change", ["next frame", "source", "apply", "move", "use_cell", "use"])
-def test_a_result_stays_what_it_was(change: str) -> None:
+def test_a_result_does_not_change_later(change: str) -> None:
     """Neither later frames nor changes, nor a source that reuses its memory, reach into it."""
     watched, depth = pipeline(), look(PERSON)
     result = watched.process(depth, [0.3], with_misfit=True)
@@ -416,7 +416,7 @@ def test_a_result_stays_what_it_was(change: str) -> None:
         assert (value == old).all()
 
 
-def test_what_the_robot_hides_is_not_seen() -> None:
+def test_blocks_that_the_robot_hides_are_not_seen() -> None:
     """Neither behind it nor within its padding; without joints it is an obstacle and hides as such."""
     watched = pipeline()
     seen = watched.process(look(), [0.3]).seen
@@ -428,7 +428,7 @@ def test_what_the_robot_hides_is_not_seen() -> None:
     assert watched.process(look(), None).seen.seen.sum() > 100
 
 
-def test_what_a_halo_may_hide_is_not_seen() -> None:
+def test_blocks_that_a_halo_may_hide_are_not_seen() -> None:
     """Beside the crate, at its own depth, nothing would be reported."""
     haloed, plain = pipeline(), pipeline(static_padding_m=0.0)
     with_halo, without = (watched.process(look(), [0.3]).seen.seen for watched in (haloed, plain))
@@ -436,7 +436,7 @@ def test_what_a_halo_may_hide_is_not_seen() -> None:
     assert with_halo.sum() < without.sum()
 
 
-def test_a_frame_tells_how_long_each_stage_took() -> None:
+def test_a_frame_reports_the_time_of_each_stage() -> None:
     watched = pipeline()
     times = watched.process(look(), [0.3]).times
     parts = (times.expected_ns, times.foreground_ns, times.density_ns, times.seen_ns, times.health_ns)
@@ -446,7 +446,7 @@ def test_a_frame_tells_how_long_each_stage_took() -> None:
     assert watched.process(look(), [0.3], with_misfit=True).times.misfit_ns > 0
 
 
-def test_misfit_is_told_where_it_is_asked_for() -> None:
+def test_misfit_is_computed_on_request() -> None:
     assert pipeline().process(look(), [0.3]).misfit is None
 
 
@@ -703,7 +703,7 @@ def test_the_marks_on_real_frames(data_dir: Path) -> None:
         assert false == 0
 
 
-def test_scenes_are_what_the_tests_take_them_for() -> None:
+def test_scenes_meet_the_assumptions_of_the_tests() -> None:
     """The person stands clear of the robot and of the crate, in full view."""
     empty, occupied = look(), look(PERSON)
     assert (occupied < empty).sum() > 300

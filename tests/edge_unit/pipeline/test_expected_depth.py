@@ -41,7 +41,7 @@ VIEWS: list[tuple[Transform, ArrayLike]] = [
 
 
 @pytest.mark.parametrize("view", range(len(VIEWS)))
-def test_expected_depth_is_what_rays_hit(view: int) -> None:
+def test_expected_depth_agrees_with_ray_casting(view: int) -> None:
     """UR3e, gripper, table, shelf, tray and floor at 1280 x 720."""
     T_world_camera, joints = VIEWS[view]
     intrinsics, cell = camera(1280, 720), demo_cell()
@@ -132,7 +132,7 @@ def test_the_static_layer_is_drawn_anew_each_time() -> None:
     assert not again.nearest_w.any()
 
 
-def test_what_stands_where_it_stood_is_not_drawn_again() -> None:
+def test_bodies_that_did_not_move_are_not_drawn_again() -> None:
     ball, other = sphere_mesh("ball", 0.2), box_mesh("other", (0.2, 0.2, 0.2))
     layer = StaticLayer(camera(160, 90), [placed("ball", ball, (0, 0, 1))])
     layer.draw(np.eye(4))
@@ -146,7 +146,7 @@ def test_what_stands_where_it_stood_is_not_drawn_again() -> None:
     assert not layer.of([]).nearest_w.any()
 
 
-def test_the_bare_robot_forgets_where_it_was() -> None:
+def test_the_bare_robot_keeps_no_old_pose() -> None:
     robot, intrinsics = small_robot(), camera(160, 90)
     layer = BareRobot(intrinsics, robot)
 
@@ -274,7 +274,7 @@ def test_after_any_way_the_band_is_that_of_a_fresh_layer() -> None:
     assert (arm.layer.columns == fresh.layer.columns).all()
 
 
-def test_links_that_stand_still_are_kept_and_all_is_as_if_drawn_anew() -> None:
+def test_links_that_did_not_move_are_kept_and_the_image_equals_a_new_one() -> None:
     """An arm that turns, rests, trembles and goes on, one link of which is lost and found again."""
     arm = Arm()
     rng = np.random.default_rng(1)
@@ -297,7 +297,7 @@ def test_trembling_joints_are_not_drawn_again() -> None:
     assert not any(arm.draw(0.4 + angle) for angle in rng.uniform(-2e-4, 2e-4, 100))
 
 
-def test_a_slow_drift_is_never_far_from_what_is_drawn() -> None:
+def test_a_slow_drift_never_moves_far_from_the_drawn_pose() -> None:
     """Steps of a twentieth of STILL_M at the tip: each is small, and all together are not."""
     arm, tip_m = Arm(), 0.4
     arm.draw(0.0)

@@ -19,7 +19,7 @@ def check(depth: Depth, static_m: NDArray[np.float32] = WALL_M, robot: NDArray[n
     return HealthCheck(CAMERA).check(depth, measured(static_m, CAMERA), robot, SETTINGS)
 
 
-def test_a_camera_that_sees_what_it_should() -> None:
+def test_a_camera_that_sees_the_expected_depth() -> None:
     rng = np.random.default_rng(0)
     health = check(measured(WALL_M + rng.normal(0.0, 0.005, CAMERA.shape), CAMERA))
     assert health.valid_share == 1.0

@@ -12,7 +12,7 @@ from tests.edge_unit.scenes import OVERHEAD, bodies, camera, measured, placed, r
 CAMERA = camera(160, 90)
 
 
-def test_what_is_expected_and_what_the_filter_leaves() -> None:
+def test_expected_depth_and_foreground() -> None:
     cell = small_cell()
     person = placed("person", cylinder_mesh("person", 0.1, 1.0), (-0.5, 0.3, 0.5))
     depth = measured(raycast([*bodies(cell, [0.3]), person], OVERHEAD, CAMERA), CAMERA)
@@ -30,7 +30,7 @@ def test_what_is_expected_and_what_the_filter_leaves() -> None:
     assert (watched.process(depth, [0.3]).voxels.keys == before).all()
 
 
-def test_a_raw_picture_comes_back_as_it_was() -> None:
+def test_a_raw_image_survives_the_round_trip() -> None:
     picture = np.arange(160 * 90, dtype=np.uint16).reshape(90, 160) * np.uint16(4)
     png = png_of(picture, 0.00025, raw=True)
     again = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)

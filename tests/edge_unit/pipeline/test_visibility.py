@@ -55,7 +55,7 @@ def test_blocks_that_hold_part_of_a_voxel_can_be_taken_out(voxel_size_m: float, 
     assert everything.seen.all()
 
 
-def test_blocks_that_are_seen_lie_wholly_in_the_picture() -> None:
+def test_seen_blocks_lie_wholly_in_the_image() -> None:
     blocks = look(FAR)
     keys = np.nonzero(blocks.seen)[0]
     index = blocks.lattice.indices(keys)
@@ -67,7 +67,7 @@ def test_blocks_that_are_seen_lie_wholly_in_the_picture() -> None:
 
 
 @pytest.mark.parametrize("image", ["depth", "limit", "robot"])
-def test_nothing_is_seen_through_what_hides_it(image: str) -> None:
+def test_hidden_blocks_are_not_seen(image: str) -> None:
     images = {"depth": FAR, "limit": FAR, "robot": FAR}
     images[image] = np.zeros(CAMERA.shape, np.uint16)
     assert not look(**images).seen.any()
@@ -85,7 +85,7 @@ def test_a_report_is_not_overwritten_by_the_next() -> None:
     assert first.seen.sum() == number > 0
 
 
-def test_a_camera_that_moved_looks_elsewhere() -> None:
+def test_a_moved_camera_sees_other_blocks() -> None:
     visibility = Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.9, 0.0)
     visibility.place(look_at((0, 0, 1.7), (0, 0, 5.0)))
     assert not visibility.find_seen(FAR, FAR, FAR).seen.any()
@@ -100,7 +100,7 @@ def test_packed_bits_start_with_the_first_block_in_the_lowest_bit() -> None:
 
 
 @pytest.mark.parametrize("shape", [(4, 4, 4), (5, 3, 7), (1, 1, 1), (2, 1, 9)])
-def test_a_coarser_block_is_seen_where_all_its_parts_are(shape: tuple[int, int, int]) -> None:
+def test_a_coarser_block_is_seen_if_all_its_parts_are(shape: tuple[int, int, int]) -> None:
     rng = np.random.default_rng(0)
     fine = SeenBlocks((rng.random(int(np.prod(shape))) < 0.9).astype(np.uint8), Lattice((-1, 2, 0), 0.1, shape))
     coarse = fine.coarser()

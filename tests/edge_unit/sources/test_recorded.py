@@ -64,7 +64,7 @@ async def test_frames_come_in_order_with_their_joints(folder: Path) -> None:
         assert frame.joints.tolist() == [number, -number]
 
 
-async def test_frames_in_the_order_asked_for(folder: Path) -> None:
+async def test_frames_in_the_configured_order(folder: Path) -> None:
     frames = await play(folder, frames=[10, "3", "3.png", 0])
     assert [int(frame.depth[0, 0]) for frame in frames] == [10, 3, 3, 0]
     assert [frame.joints.tolist()[0] for frame in frames if frame.joints is not None] == [10, 3, 3, 0]
@@ -176,7 +176,7 @@ def break_it(folder: Path, how: str) -> None:
         ("other size", "0.png: depth: expected shape (3, 4)"),
     ],
 )
-async def test_what_is_wrong_is_named_with_its_file(folder: Path, how: str, words: str) -> None:
+async def test_an_error_names_the_file(folder: Path, how: str, words: str) -> None:
     break_it(folder, how)
     with pytest.raises(SourceError) as caught:
         await play(folder)

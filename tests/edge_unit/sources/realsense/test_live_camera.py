@@ -25,7 +25,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return json.loads(ended.stdout)
 
 
-def test_the_profile_falls_back_to_what_the_port_carries(told: Any) -> None:
+def test_the_profile_falls_back_to_the_ports_limit(told: Any) -> None:
     streams = told["streams"]
     assert streams["profile"] == [640, 480, 15]
     assert streams["warning"] == (
@@ -36,7 +36,7 @@ def test_the_profile_falls_back_to_what_the_port_carries(told: Any) -> None:
     assert streams["color"] == "camera LIVE1 offers no color stream (rgb8)"
 
 
-def test_the_emitter_is_off_only_for_a_look_at_the_board(told: Any) -> None:
+def test_the_emitter_is_off_only_for_images_of_the_board(told: Any) -> None:
     emitter, global_time = zip(
         *(told["streams"][when] for when in ("before", "depth_options", "infrared_options", "options_afterwards")),
         strict=True,
@@ -56,7 +56,7 @@ def test_no_frame_is_read_twice_and_its_time_is_that_of_the_exposure(told: Any) 
     assert told["streams"]["silent"]
 
 
-def test_a_camera_in_other_hands_is_told_from_one_that_fails(told: Any) -> None:
+def test_a_camera_in_use_is_distinguished_from_one_that_fails(told: Any) -> None:
     busy, other = told["busy"].values()
     assert "camera LIVE1 is in use by another program" in busy
     assert "stop that one" in busy

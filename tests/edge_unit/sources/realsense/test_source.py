@@ -196,7 +196,7 @@ async def test_a_killed_capture_process_costs_no_frame_of_a_recording(recording:
         assert len(pids - {None}) == 3
 
 
-async def test_a_hung_capture_process_is_told_within_a_second_and_replaced(recording: Path) -> None:
+async def test_a_hung_capture_process_is_reported_within_a_second_and_replaced(recording: Path) -> None:
     async with opened(recording=recording, loop=True) as (source, _):
         await until(source, lambda status: status.state == "live")
         hung = source.pid
@@ -255,7 +255,7 @@ async def test_it_may_be_opened_again(recording: Path) -> None:
 # ---------------------------------------------------------------------- cameras that come and go
 
 
-async def test_an_absent_camera_is_named_with_what_is_there() -> None:
+async def test_an_absent_camera_is_named_with_the_connected_ones() -> None:
     source = RealsenseSource(RealsenseSourceConfig(serial="123456", open_timeout_s=1.0))
     opening = asyncio.create_task(source.open())
     status = await until(source, lambda status: status.state == "absent")
@@ -322,7 +322,7 @@ async def test_of_two_cameras_one_must_be_chosen(recording: Path, other: Path, t
 # ---------------------------------------------------------------------- the calibration board
 
 
-async def test_a_look_at_the_board_and_depth_goes_on(recording: Path) -> None:
+async def test_depth_resumes_after_images_of_the_board(recording: Path) -> None:
     async with opened(recording=recording, real_time=False) as (source, info):
         frames = source.frames()
         first = [(await anext(frames)).frame_number for _ in range(3)]
@@ -369,6 +369,6 @@ async def test_a_stream_that_is_not_there_is_named_and_depth_goes_on(other: Path
         ({"sereal": "1"}, "Extra inputs"),
     ],
 )
-def test_what_does_not_fit_together_is_refused(wrong: dict[str, Any], text: str) -> None:
+def test_contradictory_settings_are_refused(wrong: dict[str, Any], text: str) -> None:
     with pytest.raises(ValidationError, match=text):
         RealsenseSourceConfig(**wrong)

@@ -33,7 +33,7 @@ def test_each_phase_has_its_own_patience(phase: PhaseName) -> None:
 
 
 @pytest.mark.parametrize("fps", [6, 15, 30, 90])
-def test_silence_is_told_well_within_a_second_and_never_between_two_frames(fps: int) -> None:
+def test_silence_is_reported_well_within_a_second_and_never_between_two_frames(fps: int) -> None:
     watchdog = streaming(fps)
     assert watchdog.silent_s(START_NS + 2 * NS_PER_S // fps) is None
     assert watchdog.silent_s(START_NS + 700 * NS_PER_MS) == pytest.approx(0.7)

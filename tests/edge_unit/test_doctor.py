@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The doctor's findings: right, and each with what to do."""
+"""The doctor's findings: right, and each with its remedy."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ async def test_without_master_and_camera_it_gives_the_remedies() -> None:
     assert camera.level == "FAIL"
     assert "play a recording (source.recording) or simulate (source.kind: simulated)" in camera.text
     assert "secret" not in "".join(map(str, findings))
-    # It does not wait for a camera that is not there.
+    # It does not wait for an absent camera.
     assert findings[-1] is camera
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The source that the configuration chose."""
+"""The source that the configuration selects."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ TOKEN = "secret-token-0123456789"
 
 
 class Server:
-    """Speaks TLS with one certificate, refuses everything, and keeps all bytes that it was sent."""
+    """Speaks TLS with one certificate, refuses everything, and records all bytes received."""
 
     def __init__(self, certificate: trustme.LeafCert) -> None:
         self.context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -38,7 +38,7 @@ class Server:
                 if data.endswith(b"\r\n\r\n"):
                     writer.write(b"HTTP/1.1 404 Not Found\r\ncontent-length: 0\r\n\r\n")
         except OSError:
-            # A client that does not believe it breaks off.
+            # A client that does not trust it closes the connection.
             pass
         finally:
             writer.close()

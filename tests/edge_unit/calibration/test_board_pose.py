@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera's pose by simulated pictures of a board: as it should be seen, and as it should not."""
+"""The camera's pose from simulated images of a board, in good and in poor views."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looking for the board: by the simulated camera, and through a source that shows what we want."""
+"""The scan for the board: by the simulated camera, and through a source with given images."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ EMPTY = np.full(CAMERA.shape, 90, np.uint8)
 
 
 class Pictures:
-    """A source that shows these pictures, over and over."""
+    """A source that delivers these images, over and over."""
 
     def __init__(self, *pictures: NDArray[np.uint8]) -> None:
         self.info = ImageInfo("infrared", CAMERA, (0.0,) * 5, "brown_conrady", identity())
@@ -131,6 +131,6 @@ def test_an_object_before_the_board_hides_it() -> None:
     assert camera._T_image_board is not None
     clear = picture.expose(camera._T_image_board)
     hidden = np.abs(camera.take(0.0) - clear) > 40.0
-    # The tray and the arm are before a good part of it, but not before all.
+    # The tray and the arm hide a good part of it, but not all.
     board_px = np.abs(clear - clear[0, 0]) > 40.0
     assert 0.2 < hidden[board_px].mean() < 0.9

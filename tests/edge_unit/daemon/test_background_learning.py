@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The background of one camera: begun, given up, learned, found again, dropped."""
+"""The background model of one camera: started, given up, learned, loaded, dropped."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DEPTH = np.full(CAMERA.shape, 1900, np.uint16)
 
 
 class Student:
-    """One unit's learning, and what became of its commands."""
+    """The background learning of one unit, and the outcomes of its commands."""
 
     def __init__(self, folder: Path, frames: int | None = None) -> None:
         self.told: list[tuple[int, OutcomeCode]] = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the master asked for, by when it is carried out."""
+"""The master's commands, sorted by the time of their execution."""
 
 from __future__ import annotations
 

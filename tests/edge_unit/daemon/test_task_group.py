@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work that no frame waits for."""
+"""Background tasks, which no frame waits for."""
 
 from __future__ import annotations
 

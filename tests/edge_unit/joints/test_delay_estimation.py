@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How late the joints are, told by frames of a robot that moves; before a real master it is told as a warning."""
+"""The joints' delay, estimated from frames of a robot that moves; with a real master it is reported as a warning."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def pipeline(world: World) -> DepthPipeline:
 
 @pytest.fixture(scope="module")
 def frames(world: World) -> list[Frame]:
-    """Eight seconds with someone who walks by."""
+    """Eight seconds with a person who walks by."""
     camera = SimulatedCamera(world, POSE, INTRINSICS)
     return [(camera.capture(number * PERIOD_S).depth, number * PERIOD_S) for number in range(40)]
 
@@ -141,7 +141,7 @@ def test_comparisons_run_one_by_one_and_those_of_another_background_do_not_count
     first = kept_look()
     assert first is not None
     assert watch.next_comparison(history) is None
-    # Until it is done there is no other, and a frame that is kept meanwhile waits for it.
+    # Until it is done there is no other comparison, and a frame that is kept meanwhile waits for it.
     assert kept_look() is None
     first()
     assert watch.warning(0.0) is not None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which camera the master is told of."""
+"""The camera that is reported to the master."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CAMERA = CameraInfo("123", "D435", Intrinsics(848, 480, 424.1, 424.2, 423.9, 239
 
 
 class Told:
-    """Stands for the uplink."""
+    """Replaces the uplink."""
 
     def __init__(self) -> None:
         self.cameras: list[CameraInfo] = []

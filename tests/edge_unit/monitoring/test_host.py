@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the board tells of itself."""
+"""Facts of the computer."""
 
 from __future__ import annotations
 

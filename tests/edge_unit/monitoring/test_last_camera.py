@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera that was here before."""
+"""The camera of the last run."""
 
 from __future__ import annotations
 

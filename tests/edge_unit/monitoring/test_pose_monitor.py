@@ -36,12 +36,12 @@ class Watched:
         self.restart()
 
     def restart(self) -> None:
-        """As a unit that was switched off and on."""
+        """Start anew, like a unit that was switched off and on."""
         self.stance = PoseMonitor(self.folder)
         self.stance.begin(place_of("SERIAL", EYE.shape, self.pose))
 
     def looks(self, count: int, knock: Transform = HERE, share: float = 1.0) -> Iterator[Verdict]:
-        """Verdicts of `count` looks from `knock` beside its place, with the picture right of `share` covered."""
+        """Yield verdicts of `count` checks from `knock` beside its place; the image right of `share` is covered."""
         eye = SimulatedCamera(self.world, self.pose @ knock, EYE, seed=self.number)
         for _ in range(count):
             frame = eye.capture(self.t_s)
@@ -163,7 +163,7 @@ def test_without_known_surfaces_there_is_no_verdict(watched: Watched) -> None:
 
 
 def misfit_of(watched: Watched) -> Misfit:
-    """That of a frame in which nothing is out of place."""
+    """Return the misfit of a frame in which nothing is out of place."""
     list(watched.looks(1))
     assert watched.misfit is not None
     return watched.misfit

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work that comes to its end, and work that does not."""
+"""Work that ends in time, and work that does not."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ COLUMN = np.isfinite(raycast(bodies(small_cell(floor=False), [0.0])[:1], OVERHEA
 
 
 def look(*things: PlacedMesh, joints: float | None = None, noise: np.random.Generator | None = None) -> Depth:
-    """What the camera measures of the room, of `things`, and of the robot if it is there."""
+    """Return the camera's depth of the room, of `things`, and of the robot if joints are given."""
     robot = bodies(small_cell(floor=False), None if joints is None else [joints])
     depth_m = raycast([*ROOM, *things, *robot], OVERHEAD, CAMERA)
     if noise is not None:
@@ -80,7 +80,7 @@ def test_the_expected_depth_is_the_learned_one() -> None:
 
 
 def test_a_person_who_crosses_during_learning_is_still_reported() -> None:
-    """He covers each pixel of his way for 5 of 60 frames."""
+    """The person covers each pixel on the way for 5 of 60 frames."""
     empty = pipeline(robot=False)
     rng = np.random.default_rng(0)
 
@@ -117,10 +117,10 @@ def test_the_robots_shadow_fills_in_as_it_moves() -> None:
     moved = watched.learn((look(joints=angle), [angle]) for angle in np.linspace(0.0, 2.0, 9))
     shadow = ~np.isfinite(still.depth_m)
     assert 100 < shadow.sum() < 0.4 * shadow.size
-    # All but the hub, about which the arm turns.
+    # All but the hub, which the arm turns about.
     unlearned = ~np.isfinite(moved.depth_m)
     assert (unlearned & ~grown(COLUMN, 3)).sum() == 0
-    # And what filled in is the room, not the robot.
+    # The room filled in, not the robot.
     room_m = look() / 1000.0
     filled = shadow & ~unlearned & ~COLUMN
     assert (np.abs(moved.depth_m[filled] - room_m[filled]) < 0.01).mean() > 0.98
@@ -131,7 +131,7 @@ def test_the_fixed_base_leaves_no_unlearned_ring() -> None:
     watched = pipeline()
     reference = watched.learn((look(joints=angle), [angle]) for angle in np.linspace(0.0, 2.0, 9))
     ring = grown(COLUMN, 3) & ~COLUMN
-    # But for a pixel or two beside the hub.
+    # Except for a pixel or two beside the hub.
     assert np.isfinite(reference.depth_m[ring]).mean() > 0.97
     watched.use(reference)
     assert not watched.foreground(look(joints=-2.5), [-2.5])[ring].any()
@@ -139,7 +139,7 @@ def test_the_fixed_base_leaves_no_unlearned_ring() -> None:
 
 
 def test_the_robot_is_not_learned() -> None:
-    """Where it stood while the unit learned, somebody's hand is reported once it is gone."""
+    """A hand at the robot's position during learning is reported after the robot has left."""
     watched = pipeline()
     watched.use(watched.learn((look(joints=0.5), [0.5]) for _ in range(10)))
     arm = shrunk(np.isfinite(raycast(bodies(small_cell(floor=False), [0.5])[1:], OVERHEAD, CAMERA))) & ~grown(COLUMN, 2)
@@ -159,7 +159,7 @@ def test_learning_from_no_frame_is_refused() -> None:
 
 
 def test_learning_disturbs_no_frame_between() -> None:
-    """A unit learns while it works: the links that are left out while learning are filtered all the same."""
+    """A unit learns while it works: links that learning leaves out are filtered all the same."""
     watched = pipeline()
     before = watched.foreground(look(joints=0.5), [0.5])
     learner = watched.learner()
@@ -168,7 +168,7 @@ def test_learning_disturbs_no_frame_between() -> None:
         assert (watched.foreground(look(joints=0.5), [0.5]) == before).all()
 
 
-# ---------------------------------------------------------------- when the reference is void
+# ---------------------------------------------------------------- a void background model
 
 
 def test_it_is_void_when_the_camera_moved_and_kept_when_its_pose_is_refined() -> None:
@@ -284,7 +284,7 @@ def images(depth_m: float, spread_m: float = 0.01) -> dict[str, NDArray[np.float
     ],
 )
 def test_contents_that_make_no_sense_are_refused(arrays: dict[str, Any]) -> None:
-    """A depth below 0, say, would hide the whole cell."""
+    """A depth below 0, for example, would hide the whole cell."""
     with pytest.raises(InputError, match="reference: expected"):
         BackgroundModel.from_bytes(npz(**arrays))
 

@@ -55,7 +55,7 @@ def pipeline(cell: Cell | None = None, **settings: Any) -> DepthPipeline:
 def look(
     *things: Any, joints: float = 0.3, cell: Cell | None = None, noise: np.random.Generator | None = None
 ) -> Depth:
-    """What the camera measures of the small cell, its robot and `things`."""
+    """Return the camera's depth of the small cell, its robot and `things`."""
     depth_m = raycast([*bodies(cell or small_cell(), [joints]), *things], OVERHEAD, CAMERA)
     if noise is not None:
         noisy = noise.normal(0.0, 0.004, depth_m.shape)
@@ -63,7 +63,7 @@ def look(
     return measured(depth_m, CAMERA)
 
 
-# ---------------------------------------------------------------- what is known and what is not
+# ---------------------------------------------------------------- known and unknown surfaces
 
 
 def test_a_known_surface_is_no_obstacle() -> None:
@@ -118,7 +118,7 @@ def test_a_range_beyond_16_bits_ignores_everything() -> None:
 
 
 def test_known_edges_have_a_halo_and_no_more() -> None:
-    """Stereo matching makes known things look 30 mm wider; 150 mm beside them somebody left other ones."""
+    """Stereo matching makes known objects look 30 mm wider; 150 mm beside them there are unknown ones."""
     cell = small_cell(robot=False)
     watched = pipeline(cell)
     empty_m = raycast(bodies(cell, None), OVERHEAD, CAMERA)
@@ -186,7 +186,7 @@ def test_a_hand_before_the_robot_is_seen() -> None:
 
 
 def test_joint_uncertainty_widens_the_robot() -> None:
-    """By what the links can move, and evenly; zero, a scalar and an array say the same."""
+    """By the possible motion of the links, and evenly; zero, a scalar and an array give the same."""
     watched = pipeline(small_cell(floor=False))
     everything = np.full(CAMERA.shape, 1350, np.uint16)
 
@@ -197,7 +197,7 @@ def test_joint_uncertainty_widens_the_robot() -> None:
     assert 50 < sure < unsure < very
     assert robot_px([0.1]) == robot_px(0.1) == unsure
     assert robot_px(np.zeros(1)) == sure
-    # What is expected is not padded.
+    # The expected depth is not padded.
     known = watched.expected_depth([0.3], joint_uncertainty_rad=0.3)
     assert (known == watched.expected_depth([0.3])).all()
 
@@ -239,7 +239,7 @@ def test_a_robot_without_meshes_filters_nothing() -> None:
     assert np.isinf(watched.expected_depth([0.3])).all()
 
 
-# ---------------------------------------------------------------- what may change while it runs
+# ---------------------------------------------------------------- changes at run time
 
 
 def test_the_voxel_size_changes_while_it_runs() -> None:
@@ -258,7 +258,7 @@ def test_the_voxel_size_changes_while_it_runs() -> None:
 
 
 def test_voxels_are_cropped_to_the_box() -> None:
-    """He stands astride the box's border."""
+    """The person stands astride the box's border."""
     cell = small_cell(robot=False)
     cropped = replace(cell, box_min_m=np.array((-0.3, -1.0, 0.1)), box_max_m=np.array((1.0, 0.4, 1.0)))
     watched = DepthPipeline(CAMERA, OVERHEAD, cropped)
@@ -346,7 +346,7 @@ def test_an_object_that_moves_leaves_the_robot_as_it_is(monkeypatch: pytest.Monk
 
 
 def test_cell_and_settings_are_adopted_together_or_not_at_all() -> None:
-    # Too large for the settings before, so that one after the other would not do.
+    # Too large for the earlier settings, so that two changes in sequence would fail.
     hall = replace(small_cell(), box_min_m=np.full(3, -15.0), box_max_m=np.full(3, 15.0))
     watched = pipeline()
     cell, before = watched.cell, watched.process(look(PERSON), [0.3]).voxels
@@ -364,7 +364,7 @@ def test_cell_and_settings_are_adopted_together_or_not_at_all() -> None:
 
 
 def test_another_pose_of_the_camera() -> None:
-    """After a move everything is as if the pipeline had been made there."""
+    """After a move the result equals that of a pipeline made at the new pose."""
     there = look_at((-0.5, -0.6, 1.6), (0.0, 0.0, 0.1))
     depth = measured(raycast([*bodies(small_cell(), [0.3]), PERSON], there, CAMERA), CAMERA)
     moved = pipeline()
@@ -379,7 +379,7 @@ def test_another_pose_of_the_camera() -> None:
 
 
 def test_another_cell() -> None:
-    """Another robot, other CAD: everything is as if the pipeline had been made for it."""
+    """Another robot, other CAD: the result equals that of a pipeline made for them."""
     cell = replace(small_cell(), robot=None, objects=(), name="other")
     changed = pipeline()
     changed.process(look(), [0.3])
@@ -394,7 +394,7 @@ def test_another_cell() -> None:
 
 @pytest.mark.parametrize("change", ["next frame", "source", "apply", "move", "use_cell", "use"])
 def test_a_result_does_not_change_later(change: str) -> None:
-    """Neither later frames nor changes, nor a source that reuses its memory, reach into it."""
+    """Later frames, changes, and a source that reuses its memory do not change it."""
     watched, depth = pipeline(), look(PERSON)
     result = watched.process(depth, [0.3], with_misfit=True)
     assert result.misfit is not None
@@ -417,7 +417,7 @@ def test_a_result_does_not_change_later(change: str) -> None:
 
 
 def test_blocks_that_the_robot_hides_are_not_seen() -> None:
-    """Neither behind it nor within its padding; without joints it is an obstacle and hides as such."""
+    """Neither behind the robot nor within its padding; without joints it is an obstacle and hides as such."""
     watched = pipeline()
     seen = watched.process(look(), [0.3]).seen
     keys = np.nonzero(seen.seen)[0]
@@ -655,7 +655,7 @@ def test_memory_is_flat_over_10_000_frames() -> None:
 
 
 def test_a_frame_allocates_nothing_that_grows_with_it() -> None:
-    """A 1280 x 720 frame has 1.8 MB; what `process` takes is a few poses and the voxels themselves."""
+    """A 1280 x 720 frame has 1.8 MB; `process` allocates a few poses and the voxels themselves."""
     intrinsics = camera(1280, 720)
     watched, depth = DepthPipeline(intrinsics, ABOVE_TABLE, demo_cell()), demo_frame(intrinsics)
     process_moving(watched, depth, 0, 5)
@@ -671,7 +671,7 @@ def test_a_frame_allocates_nothing_that_grows_with_it() -> None:
 
 
 def test_the_marks_on_real_frames(data_dir: Path) -> None:
-    """A RealSense before an xArm7 and, in frames 0 to 3, a second robot that is in no model; default settings."""
+    """A RealSense before an xArm7 and, in frames 0 to 3, a second robot without a model; default settings."""
     folder = data_dir / "xarm7_realsense"
     cell = Cell.load(CHECKOUT / "assets" / "cells" / "xarm7" / "cell.yaml")
     intrinsics = Intrinsics(1280, 720, 908.3020, 908.2927, 642.962, 372.7315, fx_stereo=430.0)

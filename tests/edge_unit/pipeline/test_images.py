@@ -26,7 +26,7 @@ def test_expected_depth_and_foreground() -> None:
     assert mask.sum() > 50
     assert (left[mask] == depth[mask]).all()
     assert not left[~mask].any()
-    # Being looked at changes nothing.
+    # An image request changes nothing.
     assert (watched.process(depth, [0.3]).voxels.keys == before).all()
 
 
@@ -49,6 +49,6 @@ def test_colours_go_from_red_nearby_to_blue_far_away_on_one_scale() -> None:
     assert (red[1:3] > blue[1:3] + 50).all()
     assert (blue[3:] > red[3:]).all()
     assert (red[1], blue[1]) == (red[2], blue[2])
-    # What else is in the frame changes no colour.
+    # Other parts of the frame change no colour.
     alone = cv2.imdecode(np.frombuffer(png_of(picture[:, 2:3], 0.001, raw=False), np.uint8), cv2.IMREAD_UNCHANGED)
     assert alone[0, 0, 2] == red[2]

@@ -85,7 +85,7 @@ def test_the_kernels_equal_their_slow_twins(kind: str, stride: int) -> None:
 
 
 def seen_from(X: Transform) -> Misfit:
-    """The small cell, looked at from `X` beside where the camera should be."""
+    """Return the misfit of the small cell, seen from `X` beside the camera's expected pose."""
     cell = small_cell(robot=False)
     eye = camera(424, 240)
     pipeline = DepthPipeline(eye, OVERHEAD, cell)

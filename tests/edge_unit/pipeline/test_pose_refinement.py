@@ -104,7 +104,7 @@ def test_planes_have_the_normals_that_they_are_drawn_with_and_edges_have_none() 
 
 
 def frames_of(number: int, pipeline: DepthPipeline, count: int = 20) -> list[Depth]:
-    """What a camera of the demo rig measures, with people about."""
+    """Return frames of a camera of the demo rig, with people in view."""
     true = rig(demo_cell(), 4)[number]
     eye = SimulatedCamera(World.demo(people=2, seed=3, cell=demo_cell()), true, pipeline.intrinsics, seed=number)
     frames = [eye.capture(0.1 * n) for n in range(count)]

@@ -22,7 +22,7 @@ def look(depth: NDArray[np.uint16], limit: NDArray[np.uint16] = FAR, robot: NDAr
 
 
 def depth_of(blocks: SeenBlocks) -> NDArray[np.float64]:
-    """Along the camera's axis, of the middles of the seen blocks."""
+    """Distances of the seen blocks' middles along the camera's axis."""
     keys = np.nonzero(blocks.seen)[0]
     return apply(inverse(ABOVE), blocks.lattice.centres(blocks.lattice.indices(keys)))[:, 2]
 
@@ -46,7 +46,7 @@ def test_blocks_that_hold_part_of_a_voxel_can_be_taken_out(voxel_size_m: float, 
     voxels = Voxels(keys, np.ones(4, np.uint32), voxel)
     everything = SeenBlocks(np.ones(blocks.cell_count, np.uint8), blocks)
     left = everything.without(voxels)
-    # A block and a voxel overlap when they do on each axis; more than by rounding.
+    # A block and a voxel overlap if they overlap on each axis by more than rounding.
     low_m = np.array(voxel.origin_m) + voxels.indices * voxel_size_m + 1e-6
     high_m = low_m + voxel_size_m - 2e-6
     block_low_m = np.array(blocks.origin_m) + np.argwhere(np.ones(blocks.shape)) * blocks.voxel_size_m

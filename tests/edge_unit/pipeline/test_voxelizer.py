@@ -23,7 +23,7 @@ KEEP_ALL = FilterSettings(occupancy_threshold=0.05, own_share_min=0.0, support_a
 
 
 def run(voxelizer: Voxelizer, depth: Depth, mask: NDArray[np.bool_]) -> Voxels:
-    """Nothing stands before the camera: all that is marked is foreground."""
+    """Nothing is before the camera: all marked pixels are foreground."""
     intrinsics = camera(depth.shape[1], depth.shape[0])
     room = np.where(mask, np.uint16(65535), np.uint16(0))
     nobody = RobotLayer(intrinsics, None, 0.05)
@@ -116,7 +116,7 @@ def test_a_moved_camera_reports_the_same_objects_at_the_same_positions() -> None
     assert (other.keys == voxels.keys).all()
 
 
-# ---------------------------------------------------------------- how dense is dense enough
+# ---------------------------------------------------------------- the density rule
 
 
 def plate(intrinsics: Intrinsics, z_m: float, side_m: float, shift_m: tuple[float, float] = (0, 0)) -> Depth:
@@ -164,7 +164,7 @@ def test_speckle_is_noise_and_a_hand_is_not(rule: str, model: str) -> None:
 
 
 def test_the_angular_model_needs_more_points_than_the_pinhole() -> None:
-    """In the middle of the picture it expects some 30 % more points than there are."""
+    """In the middle of the image it expects some 30 % more points than there are."""
     intrinsics = camera(848, 480)
     depth = plate(intrinsics, 1.475, 0.05, (0.025, 0.025))
     for model, number in (("pinhole", 1), ("angular", 0)):

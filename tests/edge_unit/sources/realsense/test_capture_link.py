@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The link to a capture process, and the process in our hands."""
+"""The link to a capture process, and the handle of the process."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ async def test_the_end_of_a_process_is_described(script: str, how: str) -> None:
         if session.gone:
             break
     assert how in await session.ended()
-    # There is nobody to hear it, and that is no error.
+    # There is no receiver, and that is not an error.
     session.send(link.Stop())
 
 

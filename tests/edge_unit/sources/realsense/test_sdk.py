@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The RealSense SDK finds its libusb on a machine that has none, and says so where there is none at all."""
+"""The RealSense SDK finds its libusb on a machine without one, and reports it if there is none at all."""
 
 from __future__ import annotations
 

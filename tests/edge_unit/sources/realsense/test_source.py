@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The RealSense source with the real SDK: recordings, cameras that come and go, processes that hang and die."""
+"""The RealSense source with the real SDK: recordings, cameras that come and go, processes that hang and crash."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The watchdog's judgement, without a process and without waiting."""
+"""The watchdog's decisions, without a process and without waiting."""
 
 from __future__ import annotations
 

@@ -92,9 +92,10 @@ image-test: $(READY) ## two arm64 boards boot from one image, find a master and 
 fresh-machine: $(READY) ## demo and test on Debians that have only Python, its venv and make (root, mmdebstrap)
 	@$(BIN)/python -m qualification.fresh_machine $(ARGS)
 
-pictures: $(READY) ## the pictures of the README, painted anew
+pictures: $(READY) ## the pictures of the README and of docs/architecture.md, drawn anew
 	@$(BIN)/python -m simulation.demo.picture assets/pictures/demo.png
 	@$(BIN)/python -m simulation.demo.window_pictures assets/pictures
+	@$(BIN)/python scripts/draw_architecture.py
 
 test: $(READY) lint ## lint, then all tests but the slow ones; with SLOW=1 these too
 	@failed=0; \

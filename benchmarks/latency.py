@@ -176,7 +176,6 @@ class Bench:
             width, height = case.size
             source = SimulatedSourceConfig(
                 camera=camera, cameras=len(rings), width=width, height=height, fps=case.rate_hz, epoch_ns=epoch_ns,
-                handling=ring,
             )  # fmt: skip
             traces.append(state / "trace")
             document = {
@@ -189,7 +188,9 @@ class Bench:
             }
             config = state / "unit.yaml"
             config.write_text(yaml.safe_dump(document))
-            units.append(await self._start(f"unit{camera + 1}", "benchmarks.latency_probe.unit", str(config)))
+            units.append(
+                await self._start(f"unit{camera + 1}", "benchmarks.latency_probe.unit", str(config), str(ring))
+            )
         await self._all_live(url, (master, robot, *units))
         await asyncio.sleep(SETTLE_S)
         readers = await self._start(

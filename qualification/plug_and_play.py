@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make plug-and-play`: four units that know nothing but a token are plugged in, and what people do to them later.
+"""`make plug-and-play`: four units whose only input is a token are plugged in, and handled by people later.
 
-Real processes: a master, four units with simulated cameras, each in a network namespace of its own, and a robot's
-controller that moves a UR3e among them while a person walks about. They find their cameras' poses by the cell's
-board. Then one is plugged in elsewhere, and gets another address; one gets another camera; one is knocked, one is
-covered, and both are put right again. No file is edited meanwhile. Prints a table, and at the end all of it as one
-line of JSON; exits with 1 when a mark is missed.
+All processes are real: a master, four units with simulated cameras, each in its own network namespace, and a robot's
+controller that moves a UR3e while a person walks in the cell. The units find the poses of their cameras by the cell's
+board. Then one camera is knocked and one is covered, and both are put right again. One unit is plugged in elsewhere and
+gets another address. One unit gets another camera. Nobody edits a file meanwhile. Prints tables, and at the end all
+figures as one line of JSON. Exits with 1 if a mark is missed.
 """
 
 from __future__ import annotations
@@ -41,27 +41,27 @@ from simulation.world.handling import Handling
 from simulation.world.world import DEMO_CELL
 
 START_S = 60.0
-"""For a unit to be live on a busy machine."""
+"""Timeout for a unit to be live on a busy machine."""
 
 NOTICE_S = 10.0
-"""For what should take two seconds; what takes longer has missed its mark anyway."""
+"""Timeout for a change that should take two seconds; a longer time misses its mark anyway."""
 
 UNDISTURBED_S = 2.0 * BASELINE_LOOKS * PERIOD_S
-"""A unit that is to tell that its camera was moved must have seen for so long how it usually fits."""
+"""Time that the pose monitor of a unit needs for its baseline before it can report a moved camera."""
 
 QUIET_S = 15.0
-"""In which nobody touches anything, and frames are judged."""
+"""Duration of each quiet stretch, in which nobody touches anything and frames are judged."""
 
 LATE_MS = 40.0
-"""Of the joints in the second quiet stretch: twenty times what a UR robot takes."""
+"""Age of the joints in the second quiet stretch: twenty times that of a UR robot."""
 
 SETTLE_S = 2.0
-"""From a change until frames are judged."""
+"""Time from a change until frames are judged."""
 
 OTHER_SERIAL = "SIM9999999"
 
 OTHER_CAMERA = Handling(serial=OTHER_SERIAL, xyz=(0.02, -0.015, 0.01), rpy_deg=(1.0, -1.5, 2.0))
-"""Screwed on by hand: not quite where the other one was."""
+"""Another camera, mounted by hand: its place differs a little from the first one's."""
 
 KNOCK = Handling(xyz=(0.02, 0.01, 0.0), rpy_deg=(1.0, -1.0, 0.5))
 
@@ -71,12 +71,12 @@ NOTICE_S_MAX = 2.0
 ROBOT_PERCENT_MAX = 0.5
 
 ELSEWHERE, EXCHANGED, KNOCKED, COVERED = range(4)
-"""Which unit what is done to."""
+"""Index of the unit of each change."""
 
 
 @dataclass
 class Findings:
-    """What is measured, as it is found; NaN where it was not."""
+    """All measurements, as they are made; NaN where there is none."""
 
     units_live: int = 0
     files_edited: int = -1
@@ -95,12 +95,12 @@ class Findings:
 
 
 def seconds(since_ns: int, until_ns: int) -> float:
-    """Between two times."""
+    """Return the seconds between two times."""
     return round((until_ns - since_ns) / NS_PER_S, 3)
 
 
 async def plug_all_in(site: PlugSite, found: Findings, cell: Cell) -> None:
-    """One unit after the other, as a person would; each is live before the next."""
+    """Plug in one unit after the other, as a person does. Each is live before the next."""
     for index in range(UNITS):
         unit = await site.plug_in(index)
         row, live_ns = await site.when_live(unit, START_S)
@@ -112,16 +112,16 @@ async def plug_all_in(site: PlugSite, found: Findings, cell: Cell) -> None:
 
 
 def computing_s(pid: int) -> float:
-    """Processor time that a process has used, which a busy machine does not lengthen much."""
+    """Return the processor time of a process, s; a busy machine does not lengthen it much."""
     user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
     return round((int(user) + int(system)) / os.sysconf("SC_CLK_TCK"), 3)
 
 
 def note_pose(found: Findings, name: str, row: dict[str, Any], true: Transform) -> None:
-    """How good the pose is that a unit found.
+    """Record the error of the pose that a unit found.
 
     Raises:
-        FaultError: it is from elsewhere than from the board.
+        FaultError: the pose does not come from the board.
     """
     if row["pose_origin"] != "board":
         raise FaultError(f"{name}: expected a pose by the board, got one from {row['pose_origin']}")
@@ -131,7 +131,7 @@ def note_pose(found: Findings, name: str, row: dict[str, Any], true: Transform) 
 
 
 async def be_quiet(found: Findings, name: str, quiet_s: float) -> None:
-    """Nobody touches anything for a while."""
+    """Wait for a quiet stretch, and record its times."""
     await asyncio.sleep(SETTLE_S)
     begin_ns = monotonic_ns()
     await asyncio.sleep(quiet_s)
@@ -139,7 +139,7 @@ async def be_quiet(found: Findings, name: str, quiet_s: float) -> None:
 
 
 async def plug_elsewhere(site: PlugSite, found: Findings) -> None:
-    """Pull a unit's cable and plug it in again, where it gets another address: the same unit, with its pose."""
+    """Pull a unit's cable and plug it in where it gets another address. Expect the same unit with its pose."""
     unit = site.units[ELSEWHERE]
     before = await site.row(unit)
     assert before is not None
@@ -159,7 +159,7 @@ async def plug_elsewhere(site: PlugSite, found: Findings) -> None:
 
 
 async def exchange_camera(site: PlugSite, found: Findings, cell: Cell) -> None:
-    """Another camera behind one unit: the pose is void, and found anew."""
+    """Exchange the camera of one unit. Expect a void pose, then a new one."""
     unit = site.units[EXCHANGED]
     before = await site.row(unit)
     assert before is not None
@@ -177,7 +177,7 @@ async def exchange_camera(site: PlugSite, found: Findings, cell: Cell) -> None:
 
 
 async def disturb(site: PlugSite, unit: PluggedUnit, handling: Handling, state: str) -> dict[str, Any]:
-    """Do something to a camera that makes its view worthless, and put it right again."""
+    """Handle a camera so that its view is worthless, and put it right again."""
     seen_before = await site.seen_share()
     at_ns = unit.handle(handling)
     row, noticed_ns = await site.when(unit, lambda row: row["state"] == state, state, NOTICE_S)
@@ -193,7 +193,7 @@ async def disturb(site: PlugSite, unit: PluggedUnit, handling: Handling, state: 
 
 
 async def play(folder: Path, quiet_s: float) -> Findings:
-    """All of it."""
+    """Run all changes in `folder`, and return the measurements."""
     found, cell = Findings(), Cell.load(DEMO_CELL)
     processes = Processes(folder / "logs", without=(UNIT_PREFIX, MASTER_PREFIX))
     site = PlugSite(folder, processes, Switch())
@@ -224,7 +224,7 @@ async def play(folder: Path, quiet_s: float) -> Findings:
 
 
 def judge(site: PlugSite, found: Findings, cell: Cell) -> None:
-    """Hold what all units reported against what was there."""
+    """Compare the reports of all units with the truth."""
     settings = Settings()
     found.frames = {name: Frames() for name in found.quiet}
     for unit in site.units:
@@ -235,7 +235,7 @@ def judge(site: PlugSite, found: Findings, cell: Cell) -> None:
 
 
 def marks(found: Findings) -> list[Mark]:
-    """What is asked of it."""
+    """Return the marks that the measurements must meet."""
     moved, blind = found.moved, found.blind
     return [
         Mark("units live", found.units_live, at_least=UNITS),
@@ -257,7 +257,7 @@ def marks(found: Findings) -> list[Mark]:
 
 
 def _worst(values: dict[str, float]) -> float:
-    """NaN if any is."""
+    """Return the largest value; NaN if any is NaN."""
     return max(values.values(), key=lambda value: (value != value, value))
 
 
@@ -267,13 +267,13 @@ def _drop(disturbance: dict[str, Any]) -> float:
 
 
 def _share(findings: dict[str, Any]) -> float:
-    """Of what should be true, how much is."""
-    told = [value for value in findings.values() if isinstance(value, bool)]
-    return sum(told) / len(told)
+    """Return the share of the boolean findings that are true."""
+    checks = [value for value in findings.values() if isinstance(value, bool)]
+    return sum(checks) / len(checks)
 
 
 def document(found: Findings, asked: Sequence[Mark]) -> dict[str, Any]:
-    """All of it as plain values."""
+    """Return all measurements as plain values for JSON."""
     return {
         "units_live": found.units_live,
         "files_edited": found.files_edited,
@@ -288,8 +288,13 @@ def document(found: Findings, asked: Sequence[Mark]) -> dict[str, Any]:
         "computing_seconds_to_live": found.computing_s,
         "load_a_core": found.load,
         "poses": {
-            name: {"error_mm": round(mm, 3), "error_deg": round(deg, 4), "told_mm": told[0], "told_deg": told[1]}
-            for (name, (mm, deg)), told in zip(found.pose_error.items(), found.known_to.values(), strict=True)
+            name: {
+                "error_mm": round(mm, 3),
+                "error_deg": round(deg, 4),
+                "told_mm": known_to[0],
+                "told_deg": known_to[1],
+            }
+            for (name, (mm, deg)), known_to in zip(found.pose_error.items(), found.known_to.values(), strict=True)
         },
         "another_address": found.address,
         "another_camera": found.camera,
@@ -309,7 +314,7 @@ def document(found: Findings, asked: Sequence[Mark]) -> dict[str, Any]:
 
 
 def tables(found: Findings) -> tuple[Result, ...]:
-    """For people."""
+    """Return the tables for people."""
     poses = tuple(
         (
             name,
@@ -319,6 +324,7 @@ def tables(found: Findings) -> tuple[Result, ...]:
         )
         for name, (mm, deg) in found.pose_error.items()
     )
+    # Kept results have these names of columns and marks.
     columns = ("unit", "first voxel s", "live s", "computing s", "pose off mm", "off deg", "told mm", "told deg")
     disturbed = tuple(
         (name, each["seconds_to_notice"], each["seconds_to_recover"], *each["seen_share"], each["told"])
@@ -332,8 +338,8 @@ def tables(found: Findings) -> tuple[Result, ...]:
             columns,
             poses,
             remarks=(
-                f"{found.load:g} processes wanted each core; the {FIRST_VOXEL_S_MAX:g} s are for a machine that is not "
-                "busy, and with all kernels compiled.",
+                f"{found.load:g} processes waited for each core; the {FIRST_VOXEL_S_MAX:g} s are for a machine that is "
+                "not busy, and with all kernels compiled.",
                 f"Another address: live after {address_s:.2f} s; another camera: live after {camera_s:.2f} s.",
             ),
         ),
@@ -351,7 +357,7 @@ def tables(found: Findings) -> tuple[Result, ...]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run; exit code 1 when a mark is missed."""
+    """Run the qualification. Return 1 if a mark is missed."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(arguments)
     try:
@@ -379,8 +385,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="make plug-and-play", description=(__doc__ or "").split("\n\n")[1])
-    parser.add_argument("--quiet-seconds", type=float, default=QUIET_S, help=f"of each quiet stretch ({QUIET_S:g})")
-    parser.add_argument("--folder", type=Path, help="keep everything there (default: a temporary one)")
+    parser.add_argument(
+        "--quiet-seconds", type=float, default=QUIET_S, help=f"duration of each quiet stretch (default {QUIET_S:g})"
+    )
+    parser.add_argument("--folder", type=Path, help="keep all files in this folder (default: a temporary one)")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     return parser
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks.latency_probe.unit CONFIG.YAML`: the edge unit before a camera that plays prepared frames.
+"""`python -m benchmarks.latency_probe.unit CONFIG.YAML RING.NPY`: the edge unit with a camera that plays frames.
 
-All but the source is the daemon as it is installed. The frames are those of `frames`, in the file that the
-`handling` of its simulated camera names; a frame counts as taken at the moment at which it falls due.
+All but the source is the installed daemon. `benchmarks.latency_probe.frames` renders the ring beforehand. The capture
+time of a frame is its due time.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import sys
 from collections.abc import AsyncGenerator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from benchmarks.latency_probe.frames import RING_HZ, camera_phase_s
 from edge_unit.__main__ import main
-from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
+from edge_unit.sources.frame import CameraInfo, DepthFrame
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import SourceError
@@ -63,12 +64,7 @@ class RingSource:
         self._frames = None
 
 
-def ring_source(config: SimulatedSourceConfig) -> DepthSource:
-    """Make the camera that plays what lies at its `handling`."""
-    assert config.handling is not None
-    return RingSource(config, config.handling)
-
-
 if __name__ == "__main__":
-    arguments = ["run", *sys.argv[1:], "--log-level", "WARNING"]
-    sys.exit(main(arguments, {SimulatedSourceConfig: ring_source}))
+    config_path, ring_path = sys.argv[1:]
+    arguments = ["run", config_path, "--log-level", "WARNING"]
+    sys.exit(main(arguments, {SimulatedSourceConfig: partial(RingSource, ring=Path(ring_path))}))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `make soak` lets happen, and what it counts.
+"""The cell, the faults and the measurements of `make soak`.
 
 In the order of the flow:
 
-    schedule  what happens to a cell when, drawn from a seed
-    usage     memory, threads and handles of processes, and what counts as growth
-    unit      the edge unit before a camera that may be unplugged
-    site      a cell that all sorts of things happen to at once
+    schedule  times and kinds of faults, drawn from a seed
+    usage     memory, threads and handles of processes, and the limits of their growth
+    unit      the edge unit with a camera that may be unplugged
+    site      a cell with several faults at once
 """

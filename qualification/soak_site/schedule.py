@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happens to a cell when, drawn from a seed: the same seed and time, the same faults."""
+"""Times and kinds of faults, drawn from a seed. Equal seeds and durations give equal faults."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 GAP_S = 1.5
-"""Between the beginnings of two faults, on average: several are on at once."""
+"""Mean time between the beginnings of two faults; several are active at once."""
 
 HOLD_S = (0.2, 4.0)
-"""How long one lasts: from too short to be noticed, to retries at their slowest."""
+"""Shortest and longest duration of a fault: from too short to be noticed, to the slowest retries."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A sort of fault: what it strikes (one at a time), how often, and whether only in the beginning of a soak.
+    """A kind of fault: its target, its relative frequency, and `early` if it occurs only in the first part of a soak.
 
-    What ends a process that is to live long does so only then.
+    A target has one fault at a time. A fault is `early` if it ends a process that must live long.
     """
 
     target: str
@@ -28,7 +28,7 @@ class Kind:
 
 @dataclass(frozen=True)
 class Strike:
-    """One fault: when it begins, in s from the start of the faults, and how long it lasts."""
+    """One fault: its beginning in s from the start of all faults, and its duration in s."""
 
     at_s: float
     name: str
@@ -36,7 +36,7 @@ class Strike:
 
 
 def schedule(kinds: Mapping[str, Kind], seed: str, seconds: float, early: bool) -> list[Strike]:
-    """Faults in the order of their beginnings, each over by `seconds`; no target is struck twice at once."""
+    """Return faults in the order of their beginnings. Each is over by `seconds`; no target has two at once."""
     draw = random.Random(seed)
     free_s: dict[str, float] = {}
     found: list[Strike] = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cell that all sorts of things happen to at once, and how each of them is done and undone."""
+"""A cell with several faults at once: each fault begins, is held for a while, and is undone."""
 
 from __future__ import annotations
 
@@ -30,25 +30,26 @@ from shared.waiting import within
 from simulation.fleet.processes import Child
 
 GRACE_NS = round((STALE_AFTER_S + 1.0 / FPS + SLACK_S) * NS_PER_S)
-"""After a change of the scene the map may tell of before it for so long."""
+"""Time after a change of the scene in which the map may still show the scene before it."""
 
 HOUR_S = 3600
 
 STREAMS = 6
-"""Readers that come at once; every other of them reads nothing."""
+"""Readers that connect at the same time; every other one reads nothing."""
 
 AGAIN_S = 0.05
-"""Between attempts of an operator whose master is gone."""
+"""Time between attempts of an operator whose master is gone."""
 
 VOXEL_SIZES_M = (0.04, 0.03, 0.05)
 
 READ_S = 1.0
-"""Twice the stream's heartbeat."""
+"""Timeout of a reader: twice the stream's heartbeat."""
 
 RECENT = 200
-"""Answers that are kept after they were judged."""
+"""Number of newest answers that are not judged yet, and of scene changes that are kept."""
 
 KINDS: Mapping[str, Kind] = {
+    # Kept results have these names of faults.
     "unit 1 killed": Kind("unit 1", 1.0),
     "unit 1 stopped by its service": Kind("unit 1", 1.0),
     "unit 1 stands still": Kind("unit 1", 1.0),
@@ -71,14 +72,14 @@ KINDS: Mapping[str, Kind] = {
 
 @dataclass
 class Camera:
-    """What one camera sees, and whether it is plugged in."""
+    """One camera: the things in its view, and `plugged`, which is false while it is unplugged."""
 
     folder: Path
     things: tuple[Thing, ...]
     plugged: bool = True
 
     def update(self) -> None:
-        """From the next frame on it is so."""
+        """Write the image of the current state. It holds from the next frame on."""
         if self.plugged:
             show(self.folder, *self.things)
         else:
@@ -86,19 +87,19 @@ class Camera:
 
 
 class Scene:
-    """What stood in the cell at any time."""
+    """The things in the cell over time."""
 
     def __init__(self) -> None:
         names = frozenset(thing.name for thing in RESIDENTS)
         self._since: deque[tuple[int, frozenset[str], frozenset[str]]] = deque(((0, names, names),), maxlen=RECENT)
 
     def change(self, certainly: Iterable[str], perhaps: Iterable[str] = ()) -> None:
-        """From now on these stand there, of others it is `perhaps` so: they are about to come or to go."""
+        """Record that these things are in the cell from now on. Those in `perhaps` are about to appear or to leave."""
         certain = frozenset(certainly)
         self._since.append((monotonic_ns(), certain, certain.union(perhaps)))
 
     def around(self, now_ns: int) -> tuple[frozenset[str], frozenset[str]]:
-        """What stood there at all moments of the GRACE_NS before `now_ns`, and at any of them."""
+        """Return the things present in all of the `GRACE_NS` before `now_ns`, and those present in any part."""
         always, ever = None, frozenset[str]()
         for since_ns, certain, possible in reversed(self._since):
             if since_ns <= now_ns:
@@ -109,7 +110,7 @@ class Scene:
         return always or frozenset(), ever
 
     def wrong(self, answer: Answer) -> str:
-        """What an answer says that is not so, in words; empty when all of it is."""
+        """Return the first false statement of an answer as text; empty if the answer is right."""
         if answer.now_ns is None:
             return ""
         always, ever = self.around(answer.now_ns)
@@ -128,13 +129,13 @@ class Scene:
 
 @dataclass(eq=False)
 class SoakSite(Site):
-    """A site whose first unit is at the other end of a cable, and whose wall clocks may be set."""
+    """A site whose first unit is at the other end of a cable, and whose wall clocks can be set."""
 
     scene: Scene = field(init=False, default_factory=Scene)
     wrongs: list[str] = field(init=False, default_factory=list)
     judged: int = field(init=False, default=0)
     ended: list[str] = field(init=False, default_factory=list)
-    """What ended by itself."""
+    """Messages about processes that ended without being stopped."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -148,7 +149,7 @@ class SoakSite(Site):
     # ------------------------------------------------------------------ starting
 
     async def start(self) -> None:
-        """Start everything, and begin to watch."""
+        """Start all processes and the observers of the map."""
         await self.start_master(self._clocks[0].environment)
         await self.start_robot()
         for index in range(len(ADDRESSES)):
@@ -160,12 +161,12 @@ class SoakSite(Site):
             observer.start()
 
     async def start_soaked(self, index: int) -> None:
-        """Start a unit before its camera."""
-        source = SimulatedSourceConfig(camera=index, handling=self.cameras[index] / IMAGE)
+        """Start a unit with its camera."""
+        source = SimulatedSourceConfig(camera=index)
         if not self.tokens[index].exists():
             self.tokens[index].write_text(self.unit_token.read_text())
         document = {
-            "source": source.model_dump(mode="json", include={"kind", "camera", "handling"}),
+            "source": source.model_dump(mode="json", include={"kind", "camera"}),
             "master_url": f"http://{MASTER_IP if index == 0 else '127.0.0.1'}:{self.port}",
             "token_file": str(self.tokens[index]),
             "state_dir": str(self.state_dirs[index]),
@@ -174,18 +175,18 @@ class SoakSite(Site):
         config = self.folder / f"unit{index + 1}.yaml"
         config.write_text(yaml.safe_dump(document))
         child = await self.processes.start(
-            self._name(f"unit{index + 1}"), "qualification.soak_site.unit", str(config),
+            self._name(f"unit{index + 1}"), "qualification.soak_site.unit", str(config), str(self.cameras[index]),
             under=self._cable.under if index == 0 else (),
             variables=self._clocks[index + 1].environment,
         )  # fmt: skip
         self.units[index : index + 1] = [child]
 
     def close(self) -> None:
-        """Take the cable away."""
+        """Remove the cable."""
         self._cable.close()
 
     def running(self) -> Iterator[tuple[str, int]]:
-        """Names and ids of all processes that run, for whoever looks at their usage."""
+        """Yield the names and ids of all processes that run."""
         for name, child in (("master", self.master), ("robot", self.robot), *self._named_units()):
             if not child.ended:
                 yield name, child.pid
@@ -196,15 +197,15 @@ class SoakSite(Site):
     # ------------------------------------------------------------------ judging
 
     def begin_judging(self) -> None:
-        """What was answered before does not count."""
+        """Discard all answers so far; only later ones count."""
         for observer in self.watching:
             observer.answers.clear()
         self.wrongs, self.judged = [], 0
 
     def judge(self) -> None:
-        """Hold what was answered since the last time against the scene, and see who ended by itself."""
+        """Compare the answers since the last call with the scene, and record processes that ended."""
         for observer in self.watching:
-            # Its thread adds to them meanwhile.
+            # The observer's thread appends to them meanwhile.
             old = observer.answers[:-RECENT]
             del observer.answers[: len(old)]
             self._judge(observer, old)
@@ -214,7 +215,7 @@ class SoakSite(Site):
                 self.ended.append(f"{child.name}: {child.ended}; {child.log_tail()}")
 
     def judge_all(self) -> None:
-        """As `judge`, at the end."""
+        """Judge all answers that are left, at the end."""
         self.judge()
         for observer in self.watching:
             self._judge(observer, observer.answers)
@@ -226,7 +227,7 @@ class SoakSite(Site):
                 self.wrongs.append(f"{type(observer).__name__}, {answer.now_ns}: {wrong}")
 
     async def voxels(self) -> tuple[Any, ...] | None:
-        """The map, when it is complete and all units are in it; None when it is not."""
+        """Return the map if it is complete and all units are live; otherwise None."""
         with suppress(httpx.HTTPError):
             answer = (await self.operator.get("/voxels?form=keys")).raise_for_status().json()
             if answer["complete"] and answer["units_live"] == len(ADDRESSES):
@@ -236,7 +237,11 @@ class SoakSite(Site):
     # ------------------------------------------------------------------ what happens
 
     async def strike(self, name: str, hold: Callable[[], Awaitable[None]], draw: random.Random) -> None:
-        """Do what is called so, `hold`, and undo it."""
+        """Begin the fault `name`, await `hold`, and undo the fault.
+
+        Raises:
+            FaultError: no fault has this name.
+        """
         what, _, rest = name.partition(" ")
         if name in ("unit 1 killed", "unit 2 killed", "unit 1 stopped by its service"):
             await self._unit_again(int(rest[0]) - 1, "killed" in name, hold)
@@ -270,11 +275,11 @@ class SoakSite(Site):
         elif name == "the voxel size changes":
             await self._settings({"voxel_size_m": draw.choice(VOXEL_SIZES_M)}, {"voxel_size_m": 0.05}, hold)
         elif name == "an operator looks around":
-            await self._look_around()
+            await self._request_everything()
         elif name == "somebody comes by":
             await self._newcomer(hold)
         else:
-            raise FaultError(f"nobody knows how to do this: {name}")
+            raise FaultError(f"fault: expected one of {', '.join(KINDS)}, got {name}")
 
     async def _unit_again(self, index: int, kill: bool, hold: Callable[[], Awaitable[None]]) -> None:
         unit = self.units[index]
@@ -294,7 +299,7 @@ class SoakSite(Site):
 
     async def _newcomer(self, hold: Callable[[], Awaitable[None]]) -> None:
         camera, residents = self.eyes[0], [thing.name for thing in RESIDENTS]
-        # Between the picture and our word for it this process may have to wait for its core.
+        # The process may lose its core between the write of the image and the record of the change.
         self.scene.change(residents, (NEWCOMER.name,))
         camera.things = (RESIDENTS[0], NEWCOMER)
         camera.update()
@@ -313,15 +318,15 @@ class SoakSite(Site):
         await self._insist(usual)
 
     async def _insist(self, settings: dict[str, float]) -> None:
-        """Until the master has acknowledged it."""
+        """Repeat the PUT until the master acknowledges it."""
         while True:
             with suppress(httpx.HTTPError):
                 (await self.operator.put("/settings", json=settings)).raise_for_status()
                 return
             await asyncio.sleep(AGAIN_S)
 
-    async def _look_around(self) -> None:
-        """Everything that somebody may ask for; whether it can be had now is not the question."""
+    async def _request_everything(self) -> None:
+        """Request all that an operator can request. Refusals are no failure here."""
         with suppress(httpx.HTTPError):
             for path in ("/metrics", "/coverage?blocks=true", "/robot", "/cell", "/voxels?form=centres&unseen=true"):
                 await self.operator.get(path)
@@ -331,7 +336,7 @@ class SoakSite(Site):
                 await self.operator.post(f"/units/{row['id']}/refine")
 
     async def _readers(self, hold: Callable[[], Awaitable[None]]) -> None:
-        """Readers of the stream that go without a word; every other never took a message."""
+        """Connect readers to the stream and abort them. Every other one never receives a message."""
         ended = asyncio.Event()
 
         async def read(number: int) -> None:

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m qualification.soak_site.unit CONFIG.YAML`: the edge unit before a camera that may be unplugged.
+"""`python -m qualification.soak_site.unit CONFIG.YAML FOLDER`: the edge unit with a camera that may be unplugged.
 
-All but the source is the daemon as it is installed. It takes whatever picture lies beside the `handling` of a simulated
-camera; where there is none, the camera is gone.
+All but the source is the installed daemon. The camera delivers the image that lies in `FOLDER` at the time of capture.
+It is unplugged while the folder holds no image. The configuration names a simulated camera, not a recording: the source
+of a recording that fails is not opened again.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import AsyncGenerator
+from functools import partial
+from pathlib import Path
 
 from edge_unit.__main__ import main
 from edge_unit.sources.frame import CameraInfo, DepthFrame, DepthSource
@@ -20,12 +23,12 @@ from shared.errors import SourceError
 
 
 class PluggedSource(PictureSource):
-    """A camera that is there while its picture is."""
+    """A camera that is plugged in while its image exists."""
 
     async def open(self) -> CameraInfo:
         """See `DepthSource`."""
         if not self._image.exists():
-            raise SourceError(f"{self._image.parent.name}: it is not plugged in")
+            raise SourceError(f"{self._image.parent.name}: expected a camera that is plugged in, got none")
         return await super().open()
 
     async def frames(self) -> AsyncGenerator[DepthFrame, None]:
@@ -35,16 +38,16 @@ class PluggedSource(PictureSource):
             async for frame in frames:
                 yield frame
         except FileNotFoundError as error:
-            raise SourceError(f"{self._image.parent.name}: it was unplugged") from error
+            raise SourceError(f"{self._image.parent.name}: the camera was unplugged") from error
         finally:
             await frames.aclose()
 
 
-def plugged_source(config: SimulatedSourceConfig) -> DepthSource:
-    """Make the camera whose picture lies beside its `handling`."""
-    assert config.handling is not None
-    return PluggedSource(RecordedSourceConfig(folder=config.handling.parent, serial=config.serial, fps=FPS))
+def plugged_source(config: SimulatedSourceConfig, folder: Path) -> DepthSource:
+    """Return the camera whose image lies in `folder`."""
+    return PluggedSource(RecordedSourceConfig(folder=folder, serial=config.serial, fps=FPS))
 
 
 if __name__ == "__main__":
-    sys.exit(main(["run", *sys.argv[1:]], {SimulatedSourceConfig: plugged_source}))
+    config_path, image_folder = sys.argv[1:]
+    sys.exit(main(["run", config_path], {SimulatedSourceConfig: partial(plugged_source, folder=Path(image_folder))}))

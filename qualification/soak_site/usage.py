@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory, threads and handles of processes over their lifetimes, and what counts as growth."""
+"""Memory, threads and handles of processes over their lifetimes, and the limits of their growth."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from shared.clock import NS_PER_S, monotonic_ns
 SAMPLE_S = 1.0
 
 CALM_LOOKS = 3
-"""At each calm moment; who asks meanwhile has a connection open now and then."""
+"""Samples at each calm moment; a client that polls meanwhile has a connection open now and then."""
 
 MIB = 2**20
 
 GROWTH_SHARE_MAX, GROWTH_MIB_MAX = 1.05, 2.0
-"""A lifetime's last quarter may take so much more memory than its second: the first fills caches and pools."""
+"""Limits of a lifetime's last quarter against its second: a factor plus an offset. The first fills caches and pools."""
 
 LIFETIME_MIN_S = 60.0
-"""Of a process that is judged; below, it is still filling them."""
+"""Shortest lifetime that is judged; a younger process still fills its caches and pools."""
 
 SPARE = 4
-"""Threads and handles that come and go: of pools that were never full at once, and connections that a unit keeps."""
+"""Threads and handles that come and go: pools that were never full at once, connections that a unit keeps."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One look at a process; `calm` when nothing was being done to it nor to anyone."""
+    """One sample of a process; `calm` if no fault was active anywhere."""
 
     at_s: float
     rss_mib: float
@@ -42,7 +42,7 @@ class Sample:
 
 @dataclass
 class Lifetime:
-    """One process from when it was seen first."""
+    """One process from its first sample on."""
 
     name: str
     pid: int
@@ -50,11 +50,11 @@ class Lifetime:
 
     @property
     def seconds(self) -> float:
-        """How long it was seen."""
+        """Time from the first sample to the last, s."""
         return self.samples[-1].at_s - self.samples[0].at_s
 
     def quarters_mib(self) -> tuple[float, ...]:
-        """Median memory in each quarter of its lifetime."""
+        """Return the median memory in each quarter of the lifetime, MiB; NaN for a quarter without samples."""
         at_s = np.array([sample.at_s for sample in self.samples])
         rss_mib = np.array([sample.rss_mib for sample in self.samples])
         quarter = np.minimum(4.0 * (at_s - at_s[0]) / max(self.seconds, 1e-9), 3.0).astype(int)
@@ -62,12 +62,12 @@ class Lifetime:
 
     @property
     def memory_grew(self) -> bool:
-        """Whether it takes more than a process may whose caches are full."""
+        """True if the process takes more memory than the limits allow with full caches."""
         _, second, _, last = self.quarters_mib()
         return last > GROWTH_SHARE_MAX * second + GROWTH_MIB_MAX
 
     def grown(self, count: Callable[[Sample], int]) -> int:
-        """How many more threads or handles it has at the last calm moment than at any of the first half of these."""
+        """Return by how much `count` at the last calm moment exceeds the maximum of the first half of these moments."""
         counts = [count(sample) for sample in self.samples if sample.calm]
         last, before = counts[-CALM_LOOKS:], counts[:-CALM_LOOKS]
         if not before:
@@ -86,22 +86,22 @@ class Lifetime:
 
 
 class Usage:
-    """Looks at processes and all that they started."""
+    """Samples processes and all their descendants."""
 
     def __init__(self, processes: Callable[[], Iterable[tuple[str, int]]]) -> None:
-        """`processes` tells names and ids of those that run now."""
+        """`processes` returns the names and ids of all processes that run now."""
         self._processes = processes
         self._began_ns = monotonic_ns()
         self._found: dict[tuple[int, float], Lifetime] = {}
 
     async def run(self) -> None:
-        """Look every SAMPLE_S until cancelled."""
+        """Take a sample every `SAMPLE_S` until cancelled."""
         while True:
             self.look()
             await asyncio.sleep(SAMPLE_S)
 
     def look(self, calm: bool = False) -> None:
-        """Look at all of them once."""
+        """Take one sample of each process."""
         for name, pid in self._processes():
             try:
                 root = psutil.Process(pid)
@@ -113,7 +113,7 @@ class Usage:
 
     @property
     def lifetimes(self) -> Sequence[Lifetime]:
-        """All processes that were seen."""
+        """Lifetimes of all processes with a sample."""
         return list(self._found.values())
 
     def _add(self, name: str, process: psutil.Process, calm: bool) -> None:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where `make plug-and-play` plugs its units in.
+"""The network, the units and the judge of `make plug-and-play`.
 
 In the order of the flow:
 
-    switch  a switch with sockets for units, each with a network of its own
-    site    a master, a robot and units that are given nothing but a token
-    judge   where their cameras really hang, and what of their voxels is robot
+    switch  a switch with sockets for units, each in its own network
+    site    a master, a robot and units whose only input is a token
+    judge   true poses of their cameras, and voxels of the robot in their reports
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What plugged-in units told, held against the simulation's truth: where cameras hang, and what is robot."""
+"""Comparison of units' reports with the simulation's truth: poses of cameras, and voxels of the robot."""
 
 from __future__ import annotations
 
@@ -26,29 +26,32 @@ from simulation.world.world import World
 KEYS = np.dtype("<u4")
 
 ROBOT_REACH = 1
-"""A false voxel within so many of the robot's own surface is the robot's: its edges are measured beside it."""
+"""Distance in voxels from the robot's surface within which a false voxel counts as the robot's.
+
+The camera measures the edges of a thing beside it.
+"""
 
 
 def true_pose(cell: Cell, source: SimulatedSourceConfig, handled: Handling = LEFT_ALONE) -> Transform:
-    """`T_world_camera` of a simulated camera after what was done to it."""
+    """Return `T_world_camera` of a simulated camera that was handled."""
     return rig(cell, source.cameras)[source.camera] @ from_xyz_rpy(handled.xyz, np.radians(handled.rpy_deg))
 
 
 def pose_errors(found: Transform, true: Transform) -> tuple[float, float]:
-    """How far the camera is from where it was found, mm, and turned, degrees."""
+    """Return the error of a found pose: translation in mm, rotation in degrees."""
     turned = angle_rad(inverse(true) @ found)
     return 1e3 * float(np.linalg.norm(found[:3, 3] - true[:3, 3])), float(np.degrees(turned))
 
 
 def first_voxel_s(trace_path: Path, started_ns: int) -> float:
-    """From the start of a unit's process until the master had merged its first voxel; NaN when it never did."""
+    """Return the seconds from the start of a unit's process to the merge of its first voxel; NaN if there is none."""
     merged_ns = (record.merged_at_ns for record in read_trace(trace_path) if record.keys)
     return min(((at_ns - started_ns) / NS_PER_S for at_ns in merged_ns if at_ns is not None), default=float("nan"))
 
 
 @dataclass
 class Frames:
-    """Frames that were judged, and in how many of them a voxel was false, of these the robot's."""
+    """Number of judged frames, of frames with a false voxel, and of those with a voxel of the robot."""
 
     count: int = 0
     false: int = 0
@@ -59,17 +62,17 @@ class Frames:
 
     @property
     def robot_percent(self) -> float:
-        """Share of the frames with a voxel of the robot."""
+        """Share of the frames with a voxel of the robot, in percent."""
         return 100.0 * self.robot / self.count if self.count else float("nan")
 
     @property
     def false_percent(self) -> float:
-        """Share of the frames with any false voxel."""
+        """Share of the frames with any false voxel, in percent."""
         return 100.0 * self.false / self.count if self.count else float("nan")
 
 
 class Judge:
-    """One simulated camera's frames, drawn once more."""
+    """Renders the frames of one simulated camera once more, and counts its false voxels."""
 
     def __init__(self, cell: Cell, source: SimulatedSourceConfig, settings: Settings) -> None:
         intrinsics = d435i_intrinsics(source.width, source.height)
@@ -80,7 +83,7 @@ class Judge:
         self._epoch_ns = source.epoch_ns
 
     def judge(self, trace: Sequence[TraceRecord], begin_ns: int, end_ns: int) -> Frames:
-        """The frames that were captured then and merged; nobody touched the camera meanwhile."""
+        """Judge the merged frames captured in [`begin_ns`, `end_ns`). The camera must be in its place meanwhile."""
         frames = Frames()
         for record in trace:
             if record.merged_at_ns is None or not begin_ns <= record.captured_at_ns < end_ns:
@@ -99,7 +102,7 @@ class Judge:
 
 
 def robot_keys(view: View, camera: SimulatedCamera, lattice: Lattice) -> NDArray[np.uint32]:
-    """Keys of the voxels in which the robot's visible surface lies."""
+    """Return the keys (N,) of the voxels that hold the robot's visible surface."""
     rows, columns = np.nonzero(view.owner == int(Owner.ROBOT))
     z_m = view.z_m[rows, columns].astype(np.float64)
     k = camera.intrinsics

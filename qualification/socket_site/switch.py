@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A network switch with sockets, each in a network namespace of its own: what is plugged in has its own address.
+"""A network switch with sockets, each in its own network namespace: each unit has its own address.
 
-As in `faulting.network`, no namespace has a name, and the kernel takes all of it away with the last process.
+As in `faulting.network`, no namespace has a name, and the kernel removes all of them with the last process.
 """
 
 from __future__ import annotations
@@ -15,31 +15,39 @@ SWITCH = "switch0"
 NETWORK = "10.79.0.{}"
 
 MASTER_HOST = 1
-"""Of the network: the switch's own address, at which the master listens."""
+"""Host part of the switch's own address, at which the master listens."""
 
 
 class Switch:
-    """In this process's own namespace."""
+    """A bridge in the namespace of this process."""
 
     def __init__(self) -> None:
-        """Raises ConfigError when the kernel has none."""
-        # All ports hear all multicast: nobody here asks who wants which.
+        """Create the bridge.
+
+        Raises:
+            ConfigError: the kernel has no bridges.
+        """
+        # All ports receive all multicast: nothing here subscribes by IGMP.
         run("ip", "link", "add", SWITCH, "type", "bridge", "mcast_snooping", "0")
         run("ip", "address", "add", f"{self.address}/24", "dev", SWITCH)
         run("ip", "link", "set", SWITCH, "up")
 
     @property
     def address(self) -> str:
-        """The master's."""
+        """Address of the master."""
         return NETWORK.format(MASTER_HOST)
 
 
 class Socket:
-    """Where one unit is plugged in."""
+    """A port of the switch for one unit."""
 
     def __init__(self, number: int, host: int) -> None:
-        """The unit has address `host` of the network. Raises ConfigError when it cannot be made."""
-        # `echo` tells that the namespace is there; `read` keeps it until we are gone.
+        """Create the port and its namespace; the unit has address `host` of the network.
+
+        Raises:
+            ConfigError: the kernel refuses.
+        """
+        # `echo` reports that the namespace exists; `read` keeps it until this process ends.
         self._holder = subprocess.Popen(
             ("unshare", "--net", "sh", "-c", "echo; read line"), stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
@@ -54,7 +62,7 @@ class Socket:
         self.plug(host)
 
     def plug(self, host: int) -> None:
-        """Plug the cable in; the unit has this address from now on."""
+        """Plug the cable in. The unit has this address from now on."""
         self.address = NETWORK.format(host)
         run(*self.under, "ip", "address", "flush", "dev", "eth0")
         run(*self.under, "ip", "address", "add", f"{self.address}/24", "dev", "eth0")
@@ -66,5 +74,5 @@ class Socket:
         run("ip", "link", "set", self._port, "down")
 
     def close(self) -> None:
-        """Take it away with its namespace."""
+        """Remove the port and its namespace."""
         self._holder.communicate()

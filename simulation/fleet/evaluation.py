@@ -1,28 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run of simulated units was worth: what they reported, held against what was really there.
+"""Evaluation of a run of simulated units: their reports compared with the truth.
 
-Each frame's report (`edge_unit.monitoring.trace`) meets the truth that its simulated camera wrote
-(`edge_unit.sources.simulated`) by the time of capture. A frame counts when it was captured between two given times.
+The time of capture joins each frame's report (`edge_unit.monitoring.trace`) with its truth
+(`simulation.fleet.truth_file`). A frame counts if its time of capture is between two given times.
 
-*False* is a reported voxel that has no true surface of anything unknown in itself or in one of its 26 neighbours, by
-the truth of the frame itself (`simulation.cameras.truth` says how far noise may move a surface). *Missed* is a voxel
-that the frame shows (at least a tenth of the pinhole count), that stands outside the margins of what is known, and that
-the merged map does not hold at the moment at which the master has merged the frame: the union of what each unit had
-last reported. Noise of centimetres moves points over the borders of voxels; so there are two figures: `missed_fraction`
-counts a voxel as reported when it or one of its 26 neighbours is, `missed_fraction_strict` only when it is itself.
+*False*: a reported voxel without a true surface of an unknown thing in itself or in one of its 26 neighbours, by the
+truth of the same frame. `simulation.cameras.truth` defines how far noise may move a surface.
 
-*Outside the margins* are the pixels that the filter lets pass when it is shown the true depth and the true joints,
-without any allowance for uncertain joints. How many of the visible voxels are not outside is `margin_fraction`.
+*Missed*: a visible voxel outside the margins that the merged map does not hold. Visible means that the frame shows at
+least a tenth of its pinhole count. The merged map is the union of the last reports of all units, at the moment at which
+the master has merged the frame. Noise of centimetres moves points over the borders of voxels, so there are two figures.
+`missed_fraction` counts a voxel as reported if the map holds it or one of its 26 neighbours. `missed_fraction_strict`
+counts it only if the map holds the voxel itself.
+
+*Outside the margins*: the pixels that pass the filter if its input is the true depth and the true joints, without any
+allowance for uncertain joints. `margin_fraction` is the share of the visible voxels that are not outside.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,35 +36,26 @@ from shared.errors import InputError
 from shared.settings import FilterSettings
 from simulation.cameras.camera import SimulatedCamera, d435i_intrinsics, rig
 from simulation.cameras.truth import FrameTruth, TruthFinder, false_voxels, missed_voxels
+from simulation.fleet.truth_file import KEYS, TrueFrame, read_truth
 from simulation.world.scene import View
 from simulation.world.world import World
 
 MISSED_REACH = 1
-"""Voxels along each axis within which a report counts for `missed_fraction`."""
-
-KEYS = np.dtype("<u4")
+"""Distance in voxels along each axis within which a report counts for `missed_fraction`."""
 
 
 @dataclass(frozen=True)
 class UnitRun:
-    """What one unit left behind: its camera, and the file of its reports. The camera's `truth_path` has the truth."""
+    """One unit after a run: its camera, the file with its reports, and the file with the truth of its frames."""
 
     name: str
     source: SimulatedSourceConfig
     trace_path: Path
-
-
-@dataclass(frozen=True)
-class TrueFrame:
-    """One record of a truth file; keys (N,) uint32."""
-
-    captured_at_ns: int
-    visible_keys: NDArray[np.uint32]
-    surface_keys: NDArray[np.uint32]
+    truth_path: Path
 
 
 class MarginFinder:
-    """Draws a simulated camera's frames once more, and tells which visible voxels the filter may well pass over."""
+    """Renders a simulated camera's frames once more, and finds the visible voxels that the filter may leave out."""
 
     def __init__(self, source: SimulatedSourceConfig, settings: FilterSettings) -> None:
         self._source = source
@@ -76,14 +68,14 @@ class MarginFinder:
         self._finder = TruthFinder(self._intrinsics, pose, self.lattice, self._camera.noise)
 
     def truth(self, captured_at_ns: int) -> FrameTruth:
-        """The truth of the frame that was captured then, its margins included."""
+        """Return the truth of the frame with this time of capture, margins included."""
         t_s = (captured_at_ns - self._source.epoch_ns) / NS_PER_S
         view = self._camera.look(t_s)
         passes = self._pipeline.foreground(self._raw(view), self._camera.world.joints_at(t_s))
         return self._finder.find(view, np.where(passes, np.inf, 0.0).astype(np.float32))
 
     def _raw(self, view: View) -> NDArray[np.uint16]:
-        """True depth as a perfect camera would deliver it."""
+        """Return the true depth as a perfect camera delivers it: (H, W) uint16 in units of `depth_scale_m`."""
         raw = np.rint(np.where(np.isfinite(view.z_m), view.z_m, 0.0) / self._intrinsics.depth_scale_m)
         return np.minimum(raw, np.iinfo(np.uint16).max).astype(np.uint16)
 
@@ -103,13 +95,13 @@ class _Tally:
 
 
 def evaluate(units: Sequence[UnitRun], settings: FilterSettings, begin_ns: int, end_ns: int) -> dict[str, Any]:
-    """The figures of all frames captured from `begin_ns` until before `end_ns`, by CLOCK_MONOTONIC.
+    """Return the figures of all frames captured in [`begin_ns`, `end_ns`), by CLOCK_MONOTONIC.
 
-    Times of several units are compared: they ran on one machine.
+    The times of several units are compared, so all units must have run on one machine.
 
     Raises:
         ConfigError: a trace cannot be read.
-        InputError: a truth file cannot be read, or is not that of its camera; there was no frame.
+        InputError: a truth file cannot be read, or is of another camera or of other voxels; no frame is in the time.
     """
     traces = [read_trace(unit.trace_path) for unit in units]
     truths = [_true_frames(unit, settings, begin_ns, end_ns) for unit in units]
@@ -141,7 +133,7 @@ def evaluate(units: Sequence[UnitRun], settings: FilterSettings, begin_ns: int, 
         to_map_ms.append((merged_at_ns - record.captured_at_ns) / NS_PER_MS)
         map_sizes.append(len(whole))
     if not tally.frames:
-        raise InputError("evaluation: expected frames in the time that is evaluated, there was none")
+        raise InputError("evaluation: expected frames in the time that is evaluated, got none; run for a longer time")
     tally.dropped = sum(map(len, truths)) - tally.frames
     seconds = (end_ns - begin_ns) / NS_PER_S
     return {
@@ -171,7 +163,7 @@ def _judge(
     margins: MarginFinder,
     whole: NDArray[np.uint32],
 ) -> None:
-    """Count what was false and what was missed of one frame; `whole` are the keys of the merged map."""
+    """Count the false and the missed voxels of one frame; `whole` are the keys of the merged map."""
     lattice = margins.lattice
     if record.shape != lattice.shape or record.voxel_size_m != lattice.voxel_size_m:
         raise InputError(
@@ -180,7 +172,10 @@ def _judge(
         )
     truth = margins.truth(record.captured_at_ns)
     if not np.array_equal(truth.visible_keys, true.visible_keys):
-        raise InputError(f"{unit.source.truth_path}: not the truth of {unit.name}'s camera at {true.captured_at_ns}")
+        raise InputError(
+            f"{unit.truth_path}: expected the truth of {unit.name}'s camera at {true.captured_at_ns} ns, "
+            "got other voxels; name the file that belongs to this unit"
+        )
     false = len(false_voxels(np.frombuffer(record.keys, KEYS), true.surface_keys, lattice))
     outside = truth.outside_keys
     tally.frames += 1
@@ -193,29 +188,16 @@ def _judge(
 
 
 def _true_frames(unit: UnitRun, settings: FilterSettings, begin_ns: int, end_ns: int) -> dict[int, TrueFrame]:
-    """The truth of a unit's frames within the time, by their time of capture."""
-    path = unit.source.truth_path
-    if path is None:
-        raise InputError(f"{unit.name}: expected a simulated source with truth_path, got none")
-    if unit.source.truth_voxel_size_m != settings.voxel_size_m:
-        raise InputError(
-            f"{unit.name}: expected truth for voxels of {settings.voxel_size_m} m, "
-            f"got truth_voxel_size_m {unit.source.truth_voxel_size_m}"
-        )
-    return {frame.captured_at_ns: frame for frame in _read_truth(path) if begin_ns <= frame.captured_at_ns < end_ns}
-
-
-def _read_truth(path: Path) -> Iterator[TrueFrame]:
-    try:
-        with path.open("rb") as file:
-            for record in msgpack.Unpacker(file):
-                yield TrueFrame(
-                    record["captured_at_ns"],
-                    np.frombuffer(record["visible_keys"], KEYS),
-                    np.frombuffer(record["surface_keys"], KEYS),
-                )
-    except (OSError, ValueError, KeyError, TypeError, msgpack.UnpackException) as error:
-        raise InputError(f"{path}: no truth file: {error}") from error
+    """Return the truth of a unit's frames within the time, by time of capture."""
+    found = {}
+    for frame in read_truth(unit.truth_path):
+        if frame.voxel_size_m != settings.voxel_size_m:
+            raise InputError(
+                f"{unit.truth_path}: expected truth for voxels of {settings.voxel_size_m} m, got {frame.voxel_size_m} m"
+            )
+        if begin_ns <= frame.captured_at_ns < end_ns:
+            found[frame.captured_at_ns] = frame
+    return found
 
 
 def _percentiles(name: str, values_ms: list[float]) -> dict[str, float]:
@@ -223,5 +205,5 @@ def _percentiles(name: str, values_ms: list[float]) -> dict[str, float]:
 
 
 def _share(part: int, whole: int) -> float | None:
-    """None of nothing: a cell without people misses nobody."""
+    """Return `part / whole`, or None if `whole` is 0: a cell without people has nothing to miss."""
     return round(part / whole, 6) if whole else None

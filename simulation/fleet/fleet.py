@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A master, simulated units and the robot's controller, each a process of its own, as they would run in a real cell.
+"""A master, simulated units and the robot's controller, each in its own process, as in a real cell.
 
-Every unit connects from an IP address of its own: 127.0.0.2, .3 ... (all of 127.0.0.0/8 is this machine).
+Each unit connects from its own IP address: 127.0.0.2, .3 ... (all of 127.0.0.0/8 is this machine).
 """
 
 from __future__ import annotations
@@ -22,26 +22,28 @@ from shared.errors import ConfigError
 from simulation.fleet.evaluation import UnitRun
 from simulation.fleet.processes import Child, Processes
 from simulation.fleet.running_master import RunningMaster, start_master
+from simulation.fleet.unit import MODULE as UNIT_MODULE
+from simulation.fleet.unit import arguments_of
 from simulation.world.world import DEMO_CELL
 
 MASTER_PREFIX = "CELLWATCH_MASTER_"
-"""Of the variables that configure a real master."""
+"""Prefix of the environment variables that configure a real master."""
 
 FIRST_ADDRESS = IPv4Address("127.0.0.2")
-"""Of the first unit; 127.0.0.1 is the master's."""
+"""Address of the first unit; 127.0.0.1 is the master's."""
 
 QUIET_S = 5.0
-"""Warming up takes less than this when all is compiled, unless the machine is very busy."""
+"""The warm-up takes less time than this if all kernels are compiled, unless the machine is very busy."""
 
 START_S = 240.0
-"""For the master to be there on a slow machine with much else to do."""
+"""Timeout for the start of the master on a slow and busy machine."""
 
 LOG_LEVEL = ("--log-level", "WARNING")
 
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """How many, and with what."""
+    """Number of units, their cameras and the world."""
 
     units: int = 4
     people: int = 1
@@ -52,7 +54,7 @@ class FleetOptions:
     voxel_size_m: float = 0.05
     port: int = 0
     recorded: bool = False
-    """Whether units keep a record of their frames, for evaluation."""
+    """True if the units record their frames and the truth, for evaluation."""
 
 
 @dataclass(eq=False)
@@ -68,7 +70,7 @@ class FleetUnit:
 
 @dataclass(eq=False)
 class Fleet:
-    """All that was started. `folder` holds configurations, tokens, state, logs and records."""
+    """All processes of the fleet. `folder` holds configurations, tokens, state, logs and records."""
 
     options: FleetOptions
     folder: Path
@@ -79,14 +81,14 @@ class Fleet:
     _running: RunningMaster = field(init=False)
 
     def __post_init__(self) -> None:
-        # What the environment says of real units and masters does not hold here.
+        # The environment may configure real units and masters; these here must not see it.
         self.processes = Processes(self.folder / "logs", without=(UNIT_PREFIX, MASTER_PREFIX))
 
     async def start_master(self, actions: Mapping[str, str] | None = None) -> None:
-        """Start it and wait until it can be asked; `actions` of an operator on a unit are offered by its viewer.
+        """Start the master and wait until it answers. Its viewer offers `actions` of an operator on a unit.
 
         Raises:
-            MasterUnreachable: it ended before, or did not come in time.
+            MasterUnreachable: the master ended, or was not ready in time.
         """
         self._running = await start_master(
             self.processes,
@@ -100,13 +102,13 @@ class Fleet:
         self.master, self.url = self._running.child, self._running.url
 
     async def viewer_link(self) -> str | None:
-        """A link into the master's viewer, as its operator; None where none is installed."""
+        """Return a link into the master's viewer for the operator; None if no viewer is installed."""
         async with httpx.AsyncClient(base_url=self.url, headers=self._running.as_operator, trust_env=False) as client:
             answer = await client.post("/viewer/links")
         return f"{self.url}{answer.json()['path']}" if answer.is_success else None
 
     async def switch_power(self, verb: str, address: str) -> str | None:
-        """`cut` a unit's power, or `give` it again; returns why not, or None."""
+        """Cut a unit's power (`cut`) or restore it (`give`). Return the reason of a refusal, or None."""
         unit = next((unit for unit in self.units if unit.address == address), None)
         if unit is None:
             return f"expected the address of one of the {len(self.units)} units, got {address}"
@@ -119,24 +121,24 @@ class Fleet:
         elif not unit.child.ended:
             return f"{unit.name} has power already"
         else:
-            unit.child = await self._run_unit(unit.name, unit.config_path)
+            unit.child = await self._run_unit(unit.run, unit.config_path)
         return None
 
     async def start_warm_up(self) -> asyncio.Future[None]:
-        """Have all kernels compiled, once for all units. The future is done when they are.
+        """Start to compile all kernels, once for all units. The future is done when all are compiled.
 
-        It raises a ConfigError when they cannot be.
+        The future raises a ConfigError if the kernels cannot be compiled.
         """
         child = await self.processes.start("warm-up", "simulation.fleet.warm_up", may_end=True)
 
         async def finish() -> None:
             if await child.process.wait():
-                raise ConfigError(f"the kernels cannot be compiled: {child.ended}; {child.log_tail()}")
+                raise ConfigError(f"warm-up: expected the kernels to compile, got {child.ended}; {child.log_tail()}")
 
         return asyncio.ensure_future(finish())
 
     async def start_units(self) -> None:
-        """Start the robot's controller and all units; their world begins now."""
+        """Start the robot's controller and all units. The time of their world begins now."""
         epoch_ns = monotonic_ns()
         await self.processes.start(
             "robot",
@@ -159,8 +161,6 @@ class Fleet:
             epoch_ns=epoch_ns,
             people=options.people,
             seed=options.seed,
-            truth_path=state_dir / "truth.msgpack" if options.recorded else None,
-            truth_voxel_size_m=options.voxel_size_m,
         )
         address = str(FIRST_ADDRESS + index)
         trace_path = state_dir / "trace.msgpack"
@@ -174,8 +174,10 @@ class Fleet:
         }
         config_path = state_dir / "unit.yaml"
         config_path.write_text(yaml.safe_dump(document, sort_keys=False))
-        child = await self._run_unit(name, config_path)
-        self.units.append(FleetUnit(name, address, UnitRun(name, source, trace_path), child, config_path))
+        run = UnitRun(name, source, trace_path, state_dir / "truth.msgpack")
+        child = await self._run_unit(run, config_path)
+        self.units.append(FleetUnit(name, address, run, child, config_path))
 
-    async def _run_unit(self, name: str, config_path: Path) -> Child:
-        return await self.processes.start(name, "edge_unit", "run", str(config_path), *LOG_LEVEL)
+    async def _run_unit(self, run: UnitRun, config_path: Path) -> Child:
+        evaluated = arguments_of(run.truth_path if self.options.recorded else None, self.options.voxel_size_m, None)
+        return await self.processes.start(run.name, UNIT_MODULE, str(config_path), *evaluated, *LOG_LEVEL)

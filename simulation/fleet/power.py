@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The switch at the demo's units: a tiny HTTP endpoint that the master's viewer offers as buttons.
+"""The power switch of the demo's units: a small HTTP endpoint that the master's viewer offers as buttons.
 
-In a real cell the same buttons would post to a switch that feeds the units (PoE).
+In a real cell the same buttons post to a switch that feeds the units (PoE).
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from shared.waiting import within
 logger = logging.getLogger(__name__)
 
 HEAD_BYTES_MAX = 2**14
-"""Of a request; what has no body has little else."""
+"""Limit of a request's head; the requests here have no body and few headers."""
 
 REQUEST_S = 5.0
-"""For a whole request."""
+"""Timeout for a whole request."""
 
 LABELS = {"cut": "Cut this unit's power", "give": "Give it power again"}
-"""What the buttons say."""
+"""Label of the button for each action."""
 
 REASONS = {200: "OK", 404: "Not Found", 409: "Conflict"}
 
 Switch = Callable[[str, str], Awaitable[str | None]]
-"""Called with `cut` or `give` and a unit's address; returns why not, or None."""
+"""Called with `cut` or `give` and a unit's address. Returns the reason of a refusal, or None."""
 
 
 class PowerSwitch:
-    """Listens on loopback while its context is open; `actions` are for the master's `unit_actions`."""
+    """Listens on loopback while its context is open. `actions` is the value of the master's `unit_actions`."""
 
     def __init__(self, switch: Switch) -> None:
         self._switch = switch
-        # Any page that is open in a browser may post to loopback; it does not know where.
+        # Any page in a browser can post to loopback. The secret in the path keeps it out.
         self._secret = secrets.token_urlsafe(12)
         self._server: asyncio.Server | None = None
 
@@ -54,7 +54,7 @@ class PowerSwitch:
 
     @property
     def actions(self) -> dict[str, str]:
-        """What a button says, and where it posts to."""
+        """Map the label of each button to the URL that it posts to."""
         assert self._server is not None
         port = self._server.sockets[0].getsockname()[1]
         return {label: f"http://127.0.0.1:{port}/{self._secret}/{verb}/{{ip}}" for verb, label in LABELS.items()}
@@ -62,7 +62,7 @@ class PowerSwitch:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             if not await within(REQUEST_S, self._answer(reader, writer)):
-                logger.debug("power: a request that did not come to its end")
+                logger.debug("power: expected a whole request within %g s, got a part of one", REQUEST_S)
         except (asyncio.IncompleteReadError, asyncio.LimitOverrunError, ConnectionError) as error:
             logger.debug("power: %s", error)
         finally:
@@ -82,7 +82,7 @@ class PowerSwitch:
     async def _do(self, line: list[str]) -> tuple[int, str | None]:
         parts = line[1].split("/") if len(line) == 3 and line[0] == "POST" else []
         if len(parts) != 4 or not secrets.compare_digest(parts[1].encode(), self._secret.encode()):
-            return 404, "there is nothing here"
+            return 404, "expected POST to a path of this switch, got another request"
         if parts[2] not in LABELS:
             return 404, f"expected one of {', '.join(LABELS)}, got {parts[2]}"
         why = await self._switch(parts[2], unquote(parts[3]))

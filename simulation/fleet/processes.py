@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Child processes that never outlive their parent, each with a log of its own."""
+"""Child processes that never outlive their parent. Each has its own log."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError
 
 STOP_S = 1.2
-"""From the request to stop until the kill; whoever stops all of them counts on two seconds."""
+"""Time from SIGTERM to SIGKILL. Callers that stop all children count on two seconds."""
 
 TAIL_LINES = 20
-"""The end of a log that is shown when its process failed."""
+"""Number of lines of a log that an error message shows."""
 
 TAIL_BYTES = 8192
-"""So many are read for it."""
+"""Number of bytes at the end of a log that are read for it."""
 
-LOOK_S = 0.005
-"""Between looks for a file."""
+POLL_S = 0.005
+"""Time between two checks for a file."""
 
 PR_SET_PDEATHSIG = 1
-"""See prctl(2)."""
+"""Option of prctl(2): the signal that a process receives when its parent dies."""
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
-"""By which people and service managers ask for an end."""
+"""Signals by which people and service managers stop a process."""
 
 _LIBC = ctypes.CDLL(None)
 
 
 def die_with_parent(number: int = signal.SIGKILL) -> None:
-    """From now on the kernel sends this process `number` when its parent is gone, however that came to pass."""
+    """Let the kernel send signal `number` to this process when its parent dies for any reason."""
     _LIBC.prctl(PR_SET_PDEATHSIG, int(number), 0, 0, 0)
 
 
 def raise_when_stopped() -> None:
-    """From now on a request to end raises KeyboardInterrupt, even where a shell had it ignored."""
+    """Raise KeyboardInterrupt on each of `STOP_SIGNALS`, even if a shell had the signal ignored."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
@@ -53,12 +53,12 @@ def raise_when_stopped() -> None:
 
 
 class ChildNotReady(CellwatchError):
-    """A process that was started ended, or was not ready in time."""
+    """A child process ended early, or was not ready in time."""
 
 
 @dataclass(eq=False)
 class Child:
-    """A process that was started here; `may_end` is set when its end is no failure (any more)."""
+    """A child process. `may_end` is true while the end of the process is no failure."""
 
     name: str
     log: Path
@@ -67,12 +67,12 @@ class Child:
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """Process id."""
         return self.process.pid
 
     @property
     def ended(self) -> str | None:
-        """How it came to its end, in words; None while it runs."""
+        """Cause of the end as text; None while the process runs."""
         code = self.process.returncode
         if code is None:
             return None
@@ -80,11 +80,11 @@ class Child:
 
     @property
     def failed(self) -> bool:
-        """Whether it ended though nobody told it to."""
+        """True if the process ended and was not stopped from here."""
         return self.ended is not None and not self.may_end
 
     def log_tail(self) -> str:
-        """The last lines of its log, introduced."""
+        """Return the last lines of the log below a heading."""
         with self.log.open("rb") as file:
             file.seek(max(file.seek(0, os.SEEK_END) - TAIL_BYTES, 0))
             lines = file.read().decode("utf-8", "replace").splitlines()
@@ -92,14 +92,14 @@ class Child:
 
 
 class Processes:
-    """Starts processes and, when left, stops all of them.
+    """Starts processes, and stops all of them at the end of its context.
 
-    They die with this process even when it is killed. Start them from the main thread, for the kernel means the
-    thread that started them.
+    They die with this process even if it is killed. Start them from the main thread: the kernel sends the signal when
+    the thread that started them ends.
     """
 
     def __init__(self, folder: Path, without: Sequence[str] = ()) -> None:
-        """Logs go to `folder`; variables whose names start with one of `without` are not handed on."""
+        """Write logs to `folder`. Do not pass on environment variables whose names start with one of `without`."""
         self._folder = folder
         self._environment = {name: value for name, value in os.environ.items() if not name.startswith(tuple(without))}
         self._children: list[Child] = []
@@ -125,9 +125,9 @@ class Processes:
         under: Sequence[str] = (),
         variables: Mapping[str, str] | None = None,
     ) -> Child:
-        """Run `python -m module arguments` in a session of its own, so that a Ctrl-C reaches only this process.
+        """Run `python -m module arguments` in its own session, so that a Ctrl-C reaches only this process.
 
-        `under` is a command that runs another, as nsenter does; `variables` are added to the environment.
+        `under` is a command that runs another, as nsenter does. `variables` are added to the environment.
         """
         log = self._folder / f"{name}.log"
         parent = os.getpid()
@@ -135,7 +135,7 @@ class Processes:
         def in_child() -> None:
             die_with_parent()
             if os.getppid() != parent:
-                # It died before the kernel knew.
+                # The parent died before prctl took effect.
                 os.kill(os.getpid(), signal.SIGKILL)
 
         with log.open("wb") as output:
@@ -157,7 +157,7 @@ class Processes:
         return child
 
     async def stop(self, *children: Child) -> None:
-        """Tell them to stop, all at once, and kill who does not within `STOP_S`."""
+        """Stop the children, all at once. Kill those that still run after `STOP_S`."""
         running = [child for child in children if child.process.returncode is None]
         for child in running:
             child.may_end = True
@@ -173,18 +173,18 @@ class Processes:
 
 
 async def until_written(child: Child, path: Path, timeout_s: float) -> bytes:
-    """What `child` leaves in a file, as soon as it is there; it must appear whole.
+    """Return the content of a file that `child` writes, as soon as it exists. The file must appear whole.
 
     Raises:
-        ChildNotReady: it ended instead, or took longer than `timeout_s`.
+        ChildNotReady: the child ended, or took longer than `timeout_s`.
     """
     deadline_ns = monotonic_ns() + round(timeout_s * NS_PER_S)
     while not path.exists():
         if child.ended or monotonic_ns() > deadline_ns:
-            # It is told now; not once more, as one that failed later.
+            # The exception reports this end; it must not count as a failure once more.
             child.may_end = True
             raise ChildNotReady(
                 f"{child.name}: {child.ended or f'not ready within {timeout_s:g} s'}; {child.log_tail()}"
             )
-        await asyncio.sleep(LOOK_S)
+        await asyncio.sleep(POLL_S)
     return path.read_bytes()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real master as a child process, and what it says as soon as it can be asked."""
+"""A real master as a child process, and its address and tokens as soon as it answers."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from shared.errors import MasterUnreachable
 from simulation.fleet.processes import Child, ChildNotReady, Processes, until_written
 
 READY_S = 30.0
-"""For a master to be there on a busy machine."""
+"""Timeout for the start of a master on a busy machine."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunningMaster:
-    """Where it listens, and the files with the tokens that it takes."""
+    """Address of a running master, and the files with its tokens."""
 
     child: Child
     url: str
@@ -28,12 +28,12 @@ class RunningMaster:
 
     @property
     def unit_token(self) -> str:
-        """As units send it."""
+        """Token that units send."""
         return self.unit_token_file.read_text(encoding="ascii").strip()
 
     @property
     def as_operator(self) -> dict[str, str]:
-        """The header of whoever may change anything."""
+        """HTTP header of an operator."""
         return {"Authorization": f"Bearer {self.operator_token_file.read_text(encoding='ascii').strip()}"}
 
 
@@ -49,12 +49,12 @@ async def start_master(
     variables: Mapping[str, str] | None = None,
     ready_s: float = READY_S,
 ) -> RunningMaster:
-    """Start one of this cell, at a free port unless one is named, and wait until it can be asked.
+    """Start a master of `cell` and wait until it answers. Port 0 is a free port.
 
-    `options` are more of its command line, `variables` of its environment; `module` is what is run in its place.
+    `options` are added to its command line, `variables` to its environment. `module` replaces the master's own.
 
     Raises:
-        MasterUnreachable: it ended instead, or was not ready within `ready_s`.
+        MasterUnreachable: the master ended, or was not ready within `ready_s`.
     """
     ready_file = state_dir.with_suffix(".ready")
     ready_file.unlink(missing_ok=True)

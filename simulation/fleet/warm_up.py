@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiles every kernel that a simulated unit needs into the cache, so that many units need not do it at once.
+"""Compiles all kernels of a simulated unit into the cache, so that many units do not compile them at the same time.
 
-`python -m simulation.fleet.warm_up` takes a minute the first time, and a few seconds when all is compiled.
+`python -m simulation.fleet.warm_up` takes a minute the first time, and a few seconds if all kernels are compiled.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from simulation.world.world import World
 
 
 def warm_up() -> None:
-    """Run everything once. Kernels are compiled for types, not for sizes: any resolution will do."""
+    """Run each stage once. Kernels are compiled for types, not for sizes, so any resolution serves."""
     world = World.demo()
     intrinsics = d435i_intrinsics(424, 240)
     pose = rig(world.cell)[0]

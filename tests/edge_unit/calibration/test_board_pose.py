@@ -149,7 +149,7 @@ REFUSED: dict[str, tuple[Callable[[], list[NDArray[np.uint8]]], str]] = {
     ),
     "few frames": (
         lambda: pictures(before(TILTED, 0.8), count=MIN_FRAMES - 1),
-        f"in 4 of 4 pictures.* in {MIN_FRAMES} pictures",
+        f"in 4 of 4 images.* in {MIN_FRAMES} images",
     ),
 }
 

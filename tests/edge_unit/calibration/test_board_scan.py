@@ -102,7 +102,7 @@ async def test_a_source_without_images() -> None:
     assert not search.due(monotonic_ns())
     with pytest.raises(BoardError, match="no images"):
         await search.scan(BOARD, lambda seen: None)
-    with pytest.raises(SourceError, match="no picture"):
+    with pytest.raises(SourceError, match="delivered no image"):
         await BoardSearch(Pictures(), "infrared").scan(BOARD, lambda seen: None)
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import asyncio
 import sys
+import threading
 from contextlib import aclosing
 from itertools import pairwise
 from pathlib import Path
 
-import msgpack
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -20,9 +20,8 @@ from shared.cell import Cell
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import SourceError
 from shared.transforms import from_xyz_rpy
-from simulation.cameras.camera import SimulatedCamera, d435i_intrinsics, rig
-from simulation.cameras.truth import TruthFinder
-from simulation.world.handling import LEFT_ALONE, Handling
+from simulation.cameras.camera import SimulatedCamera, SimulatedFrame, d435i_intrinsics, rig
+from simulation.world.handling import LEFT_ALONE, Handling, Hands
 from simulation.world.world import DEMO_CELL, World
 
 pytestmark = pytest.mark.alone
@@ -109,30 +108,57 @@ async def test_closing_ends_the_frames_and_it_opens_again() -> None:
     await source.close()
 
 
-async def test_truth_is_appended_frame_by_frame(cell: Cell, tmp_path: Path) -> None:
-    path = tmp_path / "truth.msgpack"
-    epoch_ns = monotonic_ns()
-    source = SimulatedSource(SimulatedSourceConfig(fps=30.0, epoch_ns=epoch_ns, truth_path=path))
+class Observed:
+    """An observer that notes all calls, and the thread of each."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+        self.threads: set[str] = set()
+        self.cameras: list[SimulatedCamera] = []
+        self.frames: dict[int, tuple[int, SimulatedFrame]] = {}
+
+    def _note(self, call: str) -> None:
+        self.calls.append(call)
+        self.threads.add(threading.current_thread().name.rpartition("_")[0])
+
+    def place(self, camera: SimulatedCamera) -> None:
+        self._note("place")
+        self.cameras.append(camera)
+
+    def observe(self, captured_at_ns: int, frame_number: int, frame: SimulatedFrame) -> None:
+        self._note("observe")
+        self.frames[frame_number] = captured_at_ns, frame
+
+    def close(self) -> None:
+        self._note("close")
+
+
+async def test_an_observer_receives_each_frame_with_the_truth_behind_it(tmp_path: Path) -> None:
+    epoch_ns, observed, handling = monotonic_ns(), Observed(), tmp_path / "handling.json"
+    config = SimulatedSourceConfig(fps=30.0, epoch_ns=epoch_ns)
+    source = SimulatedSource(config, Hands(handling), observed)
     try:
-        info = await asyncio.wait_for(source.open(), WAIT_S)
+        await asyncio.wait_for(source.open(), WAIT_S)
         frames = await asyncio.wait_for(take(source, 3), WAIT_S)
+        await asyncio.to_thread(Handling(xyz=(0.02, 0.0, 0.0)).write, handling)
+        frames += await asyncio.wait_for(take(source, 1), WAIT_S)
     finally:
         await source.close()
-    unpacker = msgpack.Unpacker()
-    unpacker.feed(path.read_bytes())
-    records = list(unpacker)
-    assert [record["frame_number"] for record in records] == [frame.frame_number for frame in frames]
-    world = World.demo(people=1, seed=0, cell=cell)
-    assert info.T_world_camera is not None
-    camera = SimulatedCamera(world, info.T_world_camera, info.intrinsics)
-    finder = TruthFinder(info.intrinsics, info.T_world_camera, world.cell.lattice(0.05), camera.noise)
-    for record, frame in zip(records, frames, strict=True):
-        truth = finder.find(camera.look((frame.captured_at_ns - epoch_ns) / NS_PER_S))
-        assert record["captured_at_ns"] == frame.captured_at_ns
-        assert record["voxel_size_m"] == 0.05
-        np.testing.assert_array_equal(np.frombuffer(record["visible_keys"], "<u4"), truth.visible_keys)
-        np.testing.assert_array_equal(np.frombuffer(record["visible_counts"], "<u4"), truth.visible_counts)
-        np.testing.assert_array_equal(np.frombuffer(record["surface_keys"], "<u4"), truth.surface_keys)
+    assert observed.calls == ["place", "observe", "observe", "observe", "place", "observe", "close"]
+    assert observed.threads == {"simulated-camera"}
+    assert list(observed.frames) == [frame.frame_number for frame in frames]
+    for frame, camera in zip(frames, [observed.cameras[0]] * 3 + observed.cameras[1:], strict=True):
+        captured_at_ns, whole = observed.frames[frame.frame_number]
+        assert captured_at_ns == frame.captured_at_ns
+        np.testing.assert_array_equal(whole.depth, frame.depth)
+        view = camera.look((captured_at_ns - epoch_ns) / NS_PER_S)
+        np.testing.assert_array_equal(whole.view.z_m, view.z_m)
+
+
+@pytest.mark.parametrize("option", ["truth_path", "truth_voxel_size_m", "handling"])
+def test_no_configuration_reaches_the_evaluation(option: str) -> None:
+    with pytest.raises(ValidationError, match=option):
+        SimulatedSourceConfig.model_validate({option: "1"})
 
 
 @pytest.mark.parametrize(
@@ -141,7 +167,6 @@ async def test_truth_is_appended_frame_by_frame(cell: Cell, tmp_path: Path) -> N
         ({"camera": 4, "cameras": 4}, "expected a camera below 4, got 4"),
         ({"width": 100}, "resolution: expected one of"),
         ({"cell": "/nowhere/cell.yaml"}, "/nowhere/cell.yaml"),
-        ({"truth_path": "/nowhere/truth"}, "truth_path: .*nowhere"),
     ],
 )
 async def test_what_cannot_be_simulated_is_one_clear_error(settings: dict[str, object], text: str) -> None:
@@ -164,8 +189,7 @@ def test_a_wrong_configuration_is_refused(bad: dict[str, object]) -> None:
 
 async def test_a_camera_that_is_knocked_covered_and_exchanged(cell: Cell, tmp_path: Path) -> None:
     handling = tmp_path / "handling.json"
-    config = SimulatedSourceConfig(camera=1, fps=30.0, people=0, handling=handling)
-    source = SimulatedSource(config)
+    source = SimulatedSource(SimulatedSourceConfig(camera=1, fps=30.0, people=0), Hands(handling))
     knock = Handling(xyz=(0.02, 0.0, 0.01), rpy_deg=(1.0, 0.0, -2.0))
     try:
         info = await asyncio.wait_for(source.open(), WAIT_S)
@@ -200,6 +224,6 @@ async def test_a_camera_that_is_knocked_covered_and_exchanged(cell: Cell, tmp_pa
 async def test_hands_that_nobody_understands(tmp_path: Path) -> None:
     handling = tmp_path / "handling.json"
     handling.write_text('{"covered": "perhaps"}')
-    source = SimulatedSource(SimulatedSourceConfig(handling=handling))
+    source = SimulatedSource(SimulatedSourceConfig(), Hands(handling))
     with pytest.raises(SourceError, match="covered"):
         await asyncio.wait_for(source.open(), WAIT_S)

@@ -18,6 +18,7 @@ from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import InputError
 from shared.settings import FilterSettings
 from simulation.fleet.evaluation import UnitRun, evaluate
+from simulation.fleet.truth_file import TruthWriter
 from simulation.world.world import World
 
 FRAMES = 4
@@ -34,17 +35,16 @@ class Recorded:
         self.settings = FilterSettings()
         self.epoch_ns = monotonic_ns() - 100 * NS_PER_S
         self.sources = [
-            SimulatedSourceConfig(
-                camera=camera, cameras=2, fps=FPS, epoch_ns=self.epoch_ns, truth_path=folder / f"{camera}.truth"
-            )
-            for camera in range(2)
+            SimulatedSourceConfig(camera=camera, cameras=2, fps=FPS, epoch_ns=self.epoch_ns) for camera in range(2)
         ]
+        self._folder = folder
         self.reports: list[list[TraceRecord]] = [asyncio.run(self._look(source)) for source in self.sources]
         self.times = (self.epoch_ns, monotonic_ns())
-        self._folder = folder
 
     async def _look(self, config: SimulatedSourceConfig) -> list[TraceRecord]:
-        world, source = World.demo(), SimulatedSource(config)
+        world = World.demo()
+        writer = TruthWriter(self._truth_path(config), self.settings.voxel_size_m)
+        source = SimulatedSource(config, observer=writer)
         info = await source.open()
         assert info.T_world_camera is not None
         pipeline = DepthPipeline(info.intrinsics, info.T_world_camera, world.cell, self.settings)
@@ -64,6 +64,9 @@ class Recorded:
         await source.close()
         return records
 
+    def _truth_path(self, source: SimulatedSourceConfig) -> Path:
+        return self._folder / f"{source.camera}.truth"
+
     def runs(self, change: Change = lambda keys: keys, drop: int = 0) -> list[UnitRun]:
         """The record of both units, with each report changed and the last few never sent."""
         runs = []
@@ -75,7 +78,7 @@ class Recorded:
                 sent = index < FRAMES - drop
                 trace.add(replace(record, keys=keys, sent=sent, merged_at_ns=record.merged_at_ns if sent else None))
             trace.close()
-            runs.append(UnitRun(f"unit-{source.camera}", source, path))
+            runs.append(UnitRun(f"unit-{source.camera}", source, path, self._truth_path(source)))
         return runs
 
 
@@ -134,14 +137,14 @@ def test_only_frames_of_the_time_count(recorded: Recorded) -> None:
     second = recorded.reports[0][1].captured_at_ns
     figures = evaluate(recorded.runs()[:1], recorded.settings, second, second + 1)
     assert figures["frames"] == 1
-    with pytest.raises(InputError, match="there was none"):
+    with pytest.raises(InputError, match="got none"):
         evaluate(recorded.runs(), recorded.settings, 0, 1)
 
 
 def test_the_truth_of_another_camera_is_found_out(recorded: Recorded) -> None:
     run = recorded.runs()[0]
     other = replace(run, source=run.source.model_copy(update={"seed": 1}))
-    with pytest.raises(InputError, match="not the truth of unit-0's camera"):
+    with pytest.raises(InputError, match="truth of unit-0's camera"):
         evaluate([other], recorded.settings, *recorded.times)
 
 
@@ -154,6 +157,6 @@ def test_a_truth_file_that_is_none_is_named(recorded: Recorded, tmp_path: Path) 
     path = tmp_path / "truth"
     path.write_bytes(msgpack.packb({"captured_at_ns": 1}))
     run = recorded.runs()[0]
-    broken = replace(run, source=run.source.model_copy(update={"truth_path": path}))
+    broken = replace(run, truth_path=path)
     with pytest.raises(InputError, match=str(path)):
         evaluate([broken], recorded.settings, *recorded.times)

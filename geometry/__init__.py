@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drawing and the arithmetic of a frame, for whoever needs them; it imports only `shared`.
+"""Kernels and rendering for every package that needs them. It imports only `shared`.
 
-The folder of compiled kernels is settled here, before the first kernel is imported, so this page re-exports nothing.
+Importing this package chooses the folder of compiled kernels, before the first kernel is imported. So it re-exports
+nothing.
 In the order of the flow:
 
-    compilation/  where compiled kernels are kept and found
+    compilation/  the folder of compiled kernels
     kernels/      pure functions on arrays, compiled by numba
-    rendering/    meshes, links and padded hulls, drawn as a camera sees them
+    rendering/    depth images of meshes, links and padded hulls
 """
 
 from geometry.compilation.cache import settle

@@ -128,7 +128,7 @@ class _Server(uvicorn.Server):
         if self._gate is not None:
             print(f"master-server: {self._way_in(self._gate)}", flush=True)
         self._manager.ready(self._status())
-        if self._manager.listens:
+        if self._manager.is_present:
             self._informing = asyncio.create_task(self._manager.follow(self._status))
         if self._announcer is not None:
             self._announcing = asyncio.create_task(self._announcer.run())

@@ -1,26 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What edge units and the master agree on. It imports neither of them.
+"""Code that edge units, the master and readers share. It imports none of them.
 
 In the order of the flow:
 
-    errors         the one tree of errors that the project raises
-    configuration  YAML, environment and command line as one configuration
-    files          files of which a power cut leaves all or nothing, and state in them
+    errors         the tree of errors that the project raises
+    configuration  YAML, environment and command line merged into one configuration
+    files          atomic writes of files, and small state documents in files
     clock          the only place that reads the time
     waiting        waiting with a limit, without losing a cancellation
-    service        what the service manager that started this process is told
+    service        sd_notify messages to the service manager of this process
     transforms     rigid transforms `T_a_b` as (4, 4) matrices
     camera         pinhole intrinsics of a depth camera
     lattice        the voxel grid that the whole cell shares
     meshes         triangle meshes and their files
     urdf           a URDF file as plain joints and meshes
-    joint_table    a robot as a flat table of moving joints, out of DH rows or a URDF
+    joint_table    a robot as a flat table of moving joints, built from DH rows or a URDF
     kinematics     a robot's links at given joint positions (Algorithm 5)
-    cell_file      `cell.yaml` as checked models, and the files that it names
+    cell_file      `cell.yaml` as checked models, and the paths of the files that it names
     cell           the watched workspace: box, CAD, known objects, robot, board
-    settings       what an operator may change while everything runs
-    timebase       how far the master's clock is from a unit's
-    messages       what units and master say to each other, as models
-    wire           those messages as bytes
-    discovery      how a master is found
+    settings       settings that an operator may change at run time
+    timebase       offset between the master's clock and a unit's
+    messages       messages between units, master, robot and operators, as models
+    wire           encoding and decoding of these messages
+    discovery      discovery of masters by multicast DNS
 """

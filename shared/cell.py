@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cell: the watched workspace and all that is known to stand in it."""
+"""The cell: the watched workspace and every known body in it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class PlacedMesh:
         farthest_m = float(np.abs(pose[:3, 3]).max())
         if farthest_m > MAX_COORDINATE_M:
             raise InputError(
-                f"{self.name} T_world_mesh: expected a place within {MAX_COORDINATE_M:g} m, got {farthest_m:.4g} m"
+                f"{self.name} T_world_mesh: expected a position within {MAX_COORDINATE_M:g} m, got {farthest_m:.4g} m"
             )
         pose.flags.writeable = False
         object.__setattr__(self, "T_world_mesh", pose)
@@ -46,7 +46,7 @@ class PlacedMesh:
 
 @dataclass(frozen=True, eq=False)
 class Board:
-    """The calibration board, in the words of OpenCV's aruco module.
+    """The calibration board, in the terms of OpenCV's aruco module.
 
     Attributes:
         kind: `charuco` (chessboard with a marker in every white square) or `grid` (markers with gaps).
@@ -74,12 +74,12 @@ class Board:
         object.__setattr__(self, "T_world_board", pose)
 
     def to_document(self) -> dict[str, Any]:
-        """The board as a plain document."""
+        """Return the board as a plain document."""
         return {**vars(self), "T_world_board": self.T_world_board.tolist()}
 
     @classmethod
     def from_document(cls, document: object) -> Board:
-        """The board of `to_document`, as it came over the network.
+        """Build the board from a document of `to_document` that came over the network.
 
         Raises:
             CellError: the document is malformed.
@@ -94,15 +94,15 @@ class Board:
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """The watched box and what is known in it. Immutable; a change is a new cell.
+    """The watched box and the known bodies in it. Immutable; a change makes a new cell.
 
     Attributes:
-        name: for people.
+        name: a name for people.
         box_min_m, box_max_m: (3,) corners of the box, world frame, read-only.
-        static: CAD that never moves.
-        objects: known things that are moved by `with_object_pose`.
-        robot: at most one, with its tool.
-        board: what cameras find their pose by.
+        static: CAD bodies that never move.
+        objects: known bodies that `with_object_pose` moves.
+        robot: the robot with its tool, or None.
+        board: the calibration board, from which cameras compute their pose; or None.
     """
 
     name: str
@@ -132,8 +132,8 @@ class Cell:
         """Read `cell.yaml` and every file that it names.
 
         Raises:
-            CellError: the file or one that it names is missing or wrong; one sentence that names the file,
-                the key and what came.
+            CellError: the file or a file that it names is missing or invalid; one sentence that names the file,
+                the key and the value.
         """
         if not isinstance(path, (str, Path)):
             raise CellError(f"cell: expected the path of a cell file as text or Path, got {type(path).__name__}")
@@ -159,7 +159,7 @@ class Cell:
             raise CellError(f"{file}: {error}") from error
 
     def lattice(self, voxel_size_m: float) -> Lattice:
-        """The voxel grid of this cell's box.
+        """Return the voxel grid of this cell's box.
 
         Raises:
             InputError: the box would need too many voxels of this size.
@@ -167,14 +167,17 @@ class Cell:
         return Lattice.covering(self.box_min_m, self.box_max_m, voxel_size_m)
 
     def blocks(self, block_size_m: float) -> Lattice:
-        """The blocks by which units report what they look through; larger ones where there would be `MAX_BLOCKS`."""
+        """Return the lattice of blocks in which units report what they see through.
+
+        `block_lattice` makes the blocks larger when the box would need more than `MAX_BLOCKS`.
+        """
         return block_lattice(self.box_min_m, self.box_max_m, block_size_m)
 
     def with_object_pose(self, name: str, T_world_mesh: ArrayLike) -> Cell:
-        """The same cell with one of its objects elsewhere.
+        """Return a copy of the cell with another pose of one object.
 
         Raises:
-            InputError: no object has this name, or the pose is no rigid transform.
+            InputError: no object has this name, or the pose is not a rigid transform.
         """
         names = [body.name for body in self.objects]
         if name not in names:
@@ -189,7 +192,7 @@ class Cell:
 
     @cached_property
     def version(self) -> str:
-        """Hash of all that the cell says, as hex: equal cells, equal versions."""
+        """Hash of the cell's document as hex: equal cells have equal versions."""
         text = json.dumps(self.document(), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -201,7 +204,7 @@ class Cell:
         return {mesh.sha256: mesh for mesh in (*links, *bodies)}
 
     def document(self) -> dict[str, Any]:
-        """The cell as a plain document that names its meshes by sha256."""
+        """Return the cell as a plain document that names its meshes by sha256."""
         return {
             "name": self.name,
             "box_min_m": self.box_min_m.tolist(),
@@ -213,22 +216,22 @@ class Cell:
         }
 
     def to_document(self) -> tuple[dict[str, Any], dict[str, bytes]]:
-        """The cell as a plain document, and its meshes' canonical bytes by sha256."""
+        """Return the cell as a plain document, and its meshes' canonical bytes by sha256."""
         return self.document(), {sha256: mesh.to_bytes() for sha256, mesh in self.meshes.items()}
 
     @classmethod
     def from_document(cls, document: object, meshes: Mapping[str, bytes], like: Cell | None = None) -> Cell:
-        """The cell of `to_document`, as it came over the network.
+        """Build the cell from a document of `to_document` that came over the network.
 
-        What is equal in the cell `like`, meshes and robot, is taken from there: the same objects, and `meshes` need
-        not hold them.
+        Meshes and a robot that are equal in the cell `like` are taken from it as the same objects. `meshes` need not
+        contain these meshes.
 
         Raises:
-            CellError: the document is malformed, or a mesh is missing or not what its hash says.
+            CellError: the document is malformed, a mesh is missing, or a mesh does not match its hash.
         """
         try:
             checked = _CellDocument.model_validate(document)
-            # Each is read once, however many bodies share it.
+            # Each mesh is read once, even when several bodies share it.
             known: dict[str, bytes | TriangleMesh] = {**meshes, **(like.meshes if like else {})}
             static = tuple(_placed(body, known) for body in checked.static)
             objects = tuple(_placed(body, known) for body in checked.objects)
@@ -292,7 +295,7 @@ def _placed(body: _BodyDocument, known: dict[str, bytes | TriangleMesh]) -> Plac
 
 
 def _shape(file: Path, key: str, shape: ShapeFile, name: str) -> TriangleMesh:
-    """The mesh of a `mesh`, `box` or `cylinder`, in its own frame."""
+    """Return the mesh of a `mesh`, `box` or `cylinder`, in its own frame."""
     if shape.mesh is None:
         if shape.box is not None:
             return box_mesh(name, shape.box)
@@ -305,7 +308,7 @@ def _shape(file: Path, key: str, shape: ShapeFile, name: str) -> TriangleMesh:
 
 
 def _link_mesh(file: Path, key: str, shape: ShapeFile | None, name: str) -> TriangleMesh | None:
-    """A shape in the frame of the link that holds it."""
+    """Return a shape's mesh in the frame of the link that carries it."""
     if shape is None:
         return None
     return _shape(file, key, shape, name).transformed(shape.pose.transform())
@@ -322,7 +325,7 @@ def _robot(file: Path, content: RobotFile) -> Robot:
     except (KinematicsError, MeshError) as error:
         raise CellError(f"{file}: robot: {error}") from error
     if not robot.links:
-        raise CellError(f"{file}: robot: expected links with meshes to filter by, got none")
+        raise CellError(f"{file}: robot: expected at least one link with a mesh, got none")
     return robot
 
 
@@ -365,7 +368,7 @@ def _urdf_robot(file: Path, content: RobotFile, tool: TriangleMesh | None, T_wor
 
 
 def board_of(content: CellFile) -> Board | None:
-    """The board that a cell file describes."""
+    """Return the board that a cell file describes, or None."""
     if content.board is None:
         return None
     fields = content.board.model_dump(exclude={"pose"})

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`cell.yaml` as checked models, and the files that it names.
+"""`cell.yaml` as checked models, and the paths of the files that it names.
 
-Lengths are in metres, angles in degrees (a person writes them), and `docs/cell.md` explains every key.
+Lengths are in metres. Angles are in degrees, since people write the file. `docs/cell.md` explains every key.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from shared.meshes import MAX_COORDINATE_M
 from shared.transforms import Transform, from_xyz_rpy
 
 MAX_BODIES = 1000
-"""Static and movable bodies each; a cell exported part by part stays below, a loop that writes YAML may not."""
+"""Limit for static bodies, and for objects: a cell exported part by part stays below it, a runaway script may not."""
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Coordinate = Annotated[float, Field(strict=True, ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
@@ -38,13 +38,13 @@ class _Model(BaseModel):
 
 
 class PoseFile(_Model):
-    """A pose: turned by roll about x, pitch about y, yaw about z (fixed axes, degrees), then shifted."""
+    """A pose: rotate by roll about x, pitch about y, yaw about z (fixed axes, degrees), then shift by `xyz`."""
 
     xyz: Vector = (0.0, 0.0, 0.0)
     rpy_deg: Angles = (0.0, 0.0, 0.0)
 
     def transform(self) -> Transform:
-        """`T_parent_this`."""
+        """Return `T_parent_this` (4, 4)."""
         return from_xyz_rpy(self.xyz, np.radians(self.rpy_deg))
 
 
@@ -69,7 +69,7 @@ class CylinderFile(_Model):
 
 
 class ShapeFile(_Model):
-    """A mesh file or a primitive, and where it stands in its parent's frame."""
+    """A mesh file or a primitive, with its pose in its parent's frame."""
 
     mesh: str | None = None
     scale: Annotated[float, Field(strict=True, gt=0.0, le=1000.0)] = 1.0
@@ -88,19 +88,19 @@ class ShapeFile(_Model):
 
 
 class BodyFile(ShapeFile):
-    """A named body of the cell; its pose is in the world frame."""
+    """A named body of the cell, with its pose in the world frame."""
 
     name: Name
 
 
 class ToolFile(ShapeFile):
-    """What is screwed to the robot; its pose is in the frame of `parent`."""
+    """A tool mounted on the robot, with its pose in the frame of the link `parent`."""
 
     parent: str | None = None
 
 
 class DHJointFile(_Model):
-    """A row of standard Denavit-Hartenberg parameters and the mesh of the link behind it."""
+    """A row of standard Denavit-Hartenberg parameters and the mesh of the link after the joint."""
 
     name: Name | None = None
     kind: Literal["revolute", "prismatic"] = "revolute"
@@ -112,7 +112,7 @@ class DHJointFile(_Model):
 
 
 class DHFile(_Model):
-    """A serial robot by its rows."""
+    """A serial robot described by Denavit-Hartenberg rows."""
 
     base: ShapeFile | None = None
     joints: tuple[DHJointFile, ...] = Field(min_length=1, max_length=MAX_JOINTS)
@@ -144,7 +144,7 @@ class RobotFile(_Model):
 
 
 class BoardFile(_Model):
-    """The calibration board, in the words of OpenCV's aruco module.
+    """The calibration board, in the terms of OpenCV's aruco module.
 
     Its frame: origin at the printed pattern's top left corner, x to the right, y down, z into the board.
     """
@@ -187,11 +187,11 @@ class CellFile(_Model):
 
 
 def read_cell_file(path: str | Path) -> CellFile:
-    """Read and check `cell.yaml`; the files that it names are not opened.
+    """Read and check `cell.yaml`; do not open the files that it names.
 
     Raises:
-        CellError: it is missing, no YAML, or a key is unknown, missing or out of range; one sentence a
-            problem, each with the file, the key's path and what came.
+        CellError: the file is missing or not YAML, or a key is unknown, missing or out of range. The text has one
+            sentence for each problem, with the file, the path of the key and the value.
     """
     file = Path(path)
     try:
@@ -204,11 +204,11 @@ def read_cell_file(path: str | Path) -> CellFile:
         content = yaml.load(text, Loader=_StrictLoader)
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark is not None else ""
-        raise CellError(f"{file}: {line}expected YAML, got a fault: {error.problem}") from error
+        raise CellError(f"{file}: {line}expected YAML, got a syntax error: {error.problem}") from error
     except yaml.YAMLError as error:
-        raise CellError(f"{file}: expected YAML, got a fault: {' '.join(str(error).split())}") from error
+        raise CellError(f"{file}: expected YAML, got a syntax error: {' '.join(str(error).split())}") from error
     except RecursionError as error:
-        raise CellError(f"{file}: expected keys and values in a few levels, got them nested too deeply") from error
+        raise CellError(f"{file}: expected a few levels of nesting, got too many") from error
     if not isinstance(content, dict):
         raise CellError(f"{file}: expected keys and values, got {type(content).__name__}")
     try:
@@ -219,13 +219,13 @@ def read_cell_file(path: str | Path) -> CellFile:
 
 
 def named_file(cell_file: Path, key: str, text: str) -> Path:
-    """The file that a path in `cell.yaml` means.
+    """Resolve a path in `cell.yaml` to a file.
 
-    Either relative to `cell_file`, absolute, `$VARIABLE/...` from the environment, or `package:NAME/...`
-    for a file inside an installed Python package or distribution, which is found without importing it.
+    The path is relative to `cell_file`, absolute, `$VARIABLE/...` from the environment, or `package:NAME/...` for a
+    file inside an installed Python package or distribution. The package is found without importing it.
 
     Raises:
-        CellError: the variable or the package is not there, or no such file is; names the key.
+        CellError: the variable, the package or the file does not exist; the text names the key.
     """
     where = f"{cell_file}: {key}"
     if text.startswith("package:"):
@@ -239,7 +239,7 @@ def named_file(cell_file: Path, key: str, text: str) -> Path:
     else:
         found = cell_file.parent / text
     if not found.is_file():
-        raise CellError(f"{where}: expected a file, got nothing at {found}")
+        raise CellError(f"{where}: expected a file at {found}, found none")
     return found
 
 
@@ -260,7 +260,7 @@ def _in_package(where: str, text: str) -> Path:
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """YAML in which a key that stands twice is an error: the first one would be lost without a word."""
+    """A YAML loader that rejects duplicate keys: YAML would drop the first value silently."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
@@ -268,14 +268,14 @@ class _StrictLoader(yaml.SafeLoader):
             text = str(key.value)
             if text in seen:
                 raise yaml.constructor.ConstructorError(
-                    "while reading a mapping", node.start_mark, f"the key {text} stands there twice", key.start_mark
+                    "while reading a mapping", node.start_mark, f"duplicate key {text}", key.start_mark
                 )
             seen.add(text)
         return super().construct_mapping(node, deep)
 
 
 def _sentence(problem: Mapping[str, Any]) -> str:
-    """One of pydantic's errors as `key: expected ..., got ...`."""
+    """Describe one of pydantic's errors as `key: expected ..., got ...`."""
     key = ""
     for part in problem["loc"]:
         key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
@@ -307,13 +307,13 @@ _EXPECTED = {
     "model_type": "keys and values",
     "string_pattern_mismatch": "text that matches {pattern}",
 }
-"""What pydantic's kinds of errors expect, in the words of someone who writes YAML."""
+"""Expected value for each of pydantic's error types, in terms of YAML."""
 
 _KINDS = {dict: "keys and values", list: "a list", type(None): "nothing"}
 
 
 def _keys_at(location: tuple[int | str, ...]) -> list[str]:
-    """The keys that the file's format knows at a place in it."""
+    """Return the keys that the file format allows at a location."""
     model: Any = CellFile
     for part in location:
         if isinstance(part, int) or part not in model.model_fields:
@@ -324,7 +324,7 @@ def _keys_at(location: tuple[int | str, ...]) -> list[str]:
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """The model that an annotation holds, however deep (`tuple[Model, ...] | None`)."""
+    """Find the model nested in an annotation such as `tuple[Model, ...] | None`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for argument in getattr(annotation, "__args__", ()):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The only place that reads the time; everything else is handed a number of nanoseconds."""
+"""The only module that reads the clock; all other code takes times as arguments, in nanoseconds."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ NS_PER_US = 1_000
 
 
 def monotonic_ns() -> int:
-    """CLOCK_MONOTONIC in nanoseconds: never jumps, the same for all processes of one machine."""
+    """Return CLOCK_MONOTONIC in nanoseconds. It never jumps and is the same for all processes of a machine."""
     return time.monotonic_ns()
 
 
 def wall_ns() -> int:
-    """Nanoseconds since 1970 (UTC) for people and recordings; it may jump, so no age is ever taken from it."""
+    """Return nanoseconds since 1970 (UTC), for people and recordings. It may jump: never compute an age from it."""
     return time.time_ns()
 
 
 def stage_ns() -> int:
-    """The finest counter there is, for timing the stages of a frame; its zero means nothing."""
+    """Return the finest counter available, in nanoseconds, for timing the stages of a frame; its zero is arbitrary."""
     return time.perf_counter_ns()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A configuration from a YAML file, the environment and the command line; the later one wins."""
+"""Load a configuration from a YAML file, the environment and the command line; later sources win."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from shared.errors import ConfigError
 Model = TypeVar("Model", bound=BaseModel)
 
 SENTENCE_ITEMS = 3
-"""What is wrong beyond these is only counted."""
+"""Number of errors that a message describes; further errors are only counted."""
 
 SENTENCE_INPUT_CHARS = 60
-"""Enough to recognise a value; a megabyte of it helps nobody."""
+"""Maximum length of a quoted value: enough to recognise it, while a value may have a megabyte."""
 
 NESTING = "__"
-"""`PREFIX_SOURCE__FPS=15` is `source.fps: 15`, since a single underscore is part of many names."""
+"""Separator of levels: `PREFIX_SOURCE__FPS=15` is `source.fps: 15`. Single underscores are part of many names."""
 
 
 def load(
@@ -31,13 +31,13 @@ def load(
     prefix: str,
     overrides: Mapping[str, Any],
 ) -> Model:
-    """Read a configuration `model`.
+    """Load and check a configuration `model`.
 
-    `path` is a YAML file or None; variables of `environment` whose name starts with `prefix` come over
-    it, then `overrides`, whose keys are dotted (`source.fps`). Text of the last two is read as YAML.
+    Start from the YAML file `path`, or from nothing when it is None. Apply the variables of `environment` whose name
+    starts with `prefix`, then `overrides`, whose keys are dotted (`source.fps`). Parse text of the last two as YAML.
 
     Raises:
-        ConfigError: the file is missing or no YAML mapping, or a value does not fit; the text names it.
+        ConfigError: the file is missing or not a YAML mapping, or a value is invalid; the text names it.
     """
     where = str(path) if path is not None else "configuration"
     merged = _read(path) if path is not None else {}
@@ -55,7 +55,7 @@ def load(
 
 
 def assignments(items: Iterable[str]) -> dict[str, str]:
-    """`["a.b=1"]` of the command line as `{"a.b": "1"}`.
+    """Parse `["a.b=1"]` of the command line into `{"a.b": "1"}`.
 
     Raises:
         ConfigError: an item has no `=`.
@@ -70,16 +70,16 @@ def assignments(items: Iterable[str]) -> dict[str, str]:
 
 
 def sentence(error: ValidationError) -> str:
-    """What is wrong with the first few fields of a model, in one line that names them and what came."""
+    """Describe the first few errors of a model in one line: the field, the expectation and the value."""
     return sentence_of(error.errors(include_url=False, include_context=False))
 
 
 def sentence_of(items: Sequence[Mapping[str, Any]]) -> str:
-    """The same, of pydantic's list of what is wrong."""
+    """Describe pydantic's list of errors as `sentence` does."""
     parts = []
     for item in items[:SENTENCE_ITEMS]:
         name = ".".join(str(part) for part in item["loc"] if part != "body") or "value"
-        # A name may be a stranger's: as text in one line, and not without end.
+        # The name may come from the network: quote it and cut it, so that it stays in one line.
         name = repr(name)[1:-1][:SENTENCE_INPUT_CHARS]
         what = item["msg"][:1].lower() + item["msg"][1:]
         came = f", got {_shown(item['input'])}" if item["type"] != "missing" else ""
@@ -102,9 +102,9 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from error
     except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: no YAML: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"{path}: expected YAML: {' '.join(str(error).split())}") from error
     except RecursionError as error:
-        raise ConfigError(f"{path}: expected values in a few levels, got them nested too deeply") from error
+        raise ConfigError(f"{path}: expected a few levels of nesting, got too many") from error
     if loaded is None:
         return {}
     if not isinstance(loaded, dict):
@@ -118,9 +118,9 @@ def _scalar(value: Any, name: str) -> Any:
     try:
         return yaml.safe_load(value)
     except yaml.YAMLError as error:
-        raise ConfigError(f"{name}: no YAML value: {value!r}") from error
+        raise ConfigError(f"{name}: expected a YAML value, got {value!r}") from error
     except RecursionError as error:
-        raise ConfigError(f"{name}: expected a value in a few levels, got one nested too deeply") from error
+        raise ConfigError(f"{name}: expected a few levels of nesting, got too many") from error
 
 
 def _put(tree: dict[str, Any], dotted: str, value: Any, name: str) -> None:
@@ -128,6 +128,6 @@ def _put(tree: dict[str, Any], dotted: str, value: Any, name: str) -> None:
     for parent in parents:
         below = tree.setdefault(parent, {})
         if not isinstance(below, dict):
-            raise ConfigError(f"{name}: {parent} is a value, expected a mapping")
+            raise ConfigError(f"{name}: expected {parent} to be a mapping, got a value")
         tree = below
     tree[last] = value

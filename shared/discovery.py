@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a master is found: it tells by multicast DNS (`_cellwatch._tcp`) where it listens, and which cell it watches.
+"""Discovery by multicast DNS (`_cellwatch._tcp`): masters announce their address and their cell, units browse.
 
-Anyone on the network may tell such things. What is heard here is a place to try, and no reason to believe it.
+Anyone on the network can send an announcement. It is an address to try, and no proof of anything.
 
-Addresses come and go (a cable, DHCP); whoever listens for multicast on an interface that was not there yet stays deaf
-for ever. So both sides begin anew whenever this machine's IPv4 addresses change.
+Addresses come and go (a cable, DHCP). A socket that joined multicast before an interface had its address never receives
+on that interface. So both sides open new sockets whenever this machine's IPv4 addresses change.
 """
 
 from __future__ import annotations
@@ -30,53 +30,53 @@ from shared.waiting import within
 
 logger = logging.getLogger(__name__)
 
-# It warns of every packet that cannot be sent while a cable is out; we begin anew then, and say so once.
+# zeroconf warns of every packet that it cannot send while a cable is out; we reopen it then, and log that once.
 logging.getLogger("zeroconf").setLevel(logging.ERROR)
 
 SERVICE_TYPE = "_cellwatch._tcp.local."
 
 TTL_S = 120
-"""What is not told again is forgotten after two minutes, by who listens all the while."""
+"""mDNS TTL: listeners drop records that are not refreshed within 120 s."""
 
 MAX_OFFERS = 16
-"""More masters than any network should have; somebody may announce without end."""
+"""Limit of announcements kept: more masters than any network should have. A faulty peer may announce without end."""
 
 MAX_ADDRESSES = 8
-"""Of one master."""
+"""Limit of addresses kept for one master."""
 
 MAX_INTERFACES = 16
-"""Linux joins 20 groups with one socket (igmp_max_memberships)."""
+"""Limit of interfaces; Linux allows one socket to join 20 groups (igmp_max_memberships)."""
 
 MAX_TXT_BYTES = 200
-"""Of one value; with its name it must stay below 256."""
+"""Limit of one TXT value; with its name it must stay below 256 bytes."""
 
 MAX_LABEL_BYTES = 63
-"""Of the name that a master is announced under."""
+"""Limit of the name under which a master is announced (a DNS label)."""
 
 SHA_DIGITS = 16
-"""Of a sha256: enough to tell one from another, never to prove anything."""
+"""Announced hexadecimal digits of a sha256: enough to distinguish hashes, never to prove identity."""
 
 RESOLVE_S = 1.0
-"""For a master that was heard of to say where it is."""
+"""Timeout for resolving the address of an announced master."""
 
 SETTLE_S = 0.3
-"""Addresses mostly change several at once."""
+"""Delay after an address change, since several addresses usually change together."""
 
 POLL_S = 5.0
-"""Between looks at what the kernel may not have told, and at what is to be announced."""
+"""Period of checks for address changes that the kernel did not report, and for changes of the announcement."""
 
 RTMGRP_IPV4_IFADDR = 0x10
-"""Of rtnetlink: an IPv4 address came or went."""
+"""rtnetlink multicast group: an IPv4 address was added or removed."""
 
 INTERNAL = ("docker", "br-", "veth", "virbr", "lxc", "cni", "l4tbr")
-"""Interfaces to containers and virtual machines, and a Jetson's USB console, which has one address on all of them."""
+"""Prefixes of interfaces to containers and virtual machines, and of a Jetson's USB console (same address on all)."""
 
 ANYWHERE = ("0.0.0.0", "::")
 
 
 @dataclass(frozen=True)
 class Announcement:
-    """What a master tells of itself. `fingerprint` is the certificate's sha256 or its beginning; empty without TLS."""
+    """Announcement of a master. `fingerprint` is a prefix of the certificate's sha256; it is empty without TLS."""
 
     cell: str
     cell_sha256: str
@@ -86,7 +86,7 @@ class Announcement:
     minor: int = CONTRACT_MINOR
 
     def properties(self) -> dict[str, str]:
-        """As it travels, each value bounded."""
+        """Return the TXT record, each value within its limit."""
         return {
             "cell": shortened(self.cell),
             "sha256": self.cell_sha256[:SHA_DIGITS],
@@ -99,7 +99,7 @@ class Announcement:
 
 @dataclass(frozen=True)
 class Offer:
-    """A master that was heard of: its name, what it tells of itself, and its URLs, each another way to it."""
+    """A discovered master: its name, its announcement, and its addresses, each an alternative."""
 
     name: str
     says: Announcement
@@ -108,16 +108,16 @@ class Offer:
 
     @property
     def urls(self) -> tuple[str, ...]:
-        """Where it claims to be."""
+        """URLs under which the master says that it listens."""
         scheme = "https" if self.says.tls else "http"
         return tuple(f"{scheme}://{address}:{self.port}" for address in self.addresses)
 
 
 def offer_of(name: str, port: int | None, addresses: Sequence[str], properties: Mapping[bytes, bytes | None]) -> Offer:
-    """An offer from what came by multicast; nothing in it is longer than what we would send.
+    """Build an offer from a multicast record; cut values to the lengths that we would send ourselves.
 
     Raises:
-        WireError: it is no announcement of ours.
+        WireError: the record is not a valid announcement.
     """
     values = {
         key: (properties.get(key.encode()) or b"")[: MAX_TXT_BYTES + 1].decode("utf-8", "replace")
@@ -129,7 +129,7 @@ def offer_of(name: str, port: int | None, addresses: Sequence[str], properties: 
     for key, text in (("name", label), *values.items()):
         if not text.isprintable() or len(text.encode()) > MAX_TXT_BYTES:
             raise WireError(f"announcement {label!r:.80}: {key}: expected {MAX_TXT_BYTES} printable bytes at most")
-    # Masters of contract 5.0 told no minor.
+    # Masters of contract 5.0 announced no minor.
     contract, minor = values["contract"], values["minor"] or "0"
     if not (_is_number(contract) and _is_number(minor)) or not values["cell"]:
         raise WireError(f"announcement {label!r:.80}: expected a cell and a contract version")
@@ -149,20 +149,20 @@ def _is_number(text: str) -> bool:
 
 
 def shortened(text: str, max_bytes: int = MAX_TXT_BYTES) -> str:
-    """`text` as it is announced: its beginning where it is long, and nothing that is not printable."""
+    """Cut `text` to `max_bytes` of UTF-8, and replace characters that are not printable by `?`."""
     printable = "".join(letter if letter.isprintable() else "?" for letter in text)
     return printable.encode()[:max_bytes].decode("utf-8", "ignore")
 
 
 def own_addresses() -> tuple[IPv4Interface, ...]:
-    """This machine's IPv4 addresses with their networks, in order; not those that lead only to guests on it."""
+    """Return this machine's IPv4 addresses with their networks, sorted, without interfaces to guests (`INTERNAL`)."""
     adapters = [adapter for adapter in ifaddr.get_adapters() if not adapter.nice_name.startswith(INTERNAL)]
     ips = [ip for adapter in adapters for ip in adapter.ips if ip.is_IPv4]
     return tuple(sorted({IPv4Interface(f"{ip.ip}/{ip.network_prefix}") for ip in ips}))
 
 
 def only_loopback(host: str) -> bool:
-    """Whether who listens at `host` hears nobody but this machine."""
+    """Return True if `host` is a loopback address."""
     try:
         return ip_address(host).is_loopback
     except ValueError:
@@ -170,7 +170,7 @@ def only_loopback(host: str) -> bool:
 
 
 class AddressChanges:
-    """Tells that this machine's addresses changed: as the kernel says it, or else by looking now and then."""
+    """Detect changes of this machine's addresses: from the kernel's notifications, or else by polling."""
 
     def __init__(self) -> None:
         self._changed = asyncio.Event()
@@ -182,10 +182,10 @@ class AddressChanges:
             self._netlink = socket.socket(socket.AF_NETLINK, kind, socket.NETLINK_ROUTE)
             self._netlink.bind((0, RTMGRP_IPV4_IFADDR))
         except OSError as error:
-            logger.debug("the kernel does not tell of addresses: %s", error)
+            logger.debug("no address notifications from the kernel, polling instead: %s", error)
             self.__exit__(None, None, None)
         else:
-            asyncio.get_running_loop().add_reader(self._netlink.fileno(), self._heard)
+            asyncio.get_running_loop().add_reader(self._netlink.fileno(), self._on_netlink)
         return self
 
     def __exit__(
@@ -197,7 +197,7 @@ class AddressChanges:
             self._netlink = None
 
     async def within(self, timeout_s: float, own: Sequence[IPv4Interface]) -> bool:
-        """Whether they changed within `timeout_s`, or are others than `own`."""
+        """Return True if the addresses change within `timeout_s`, or differ from `own`."""
         if await within(timeout_s, self._changed.wait()):
             await asyncio.sleep(SETTLE_S)
             self._changed.clear()
@@ -205,11 +205,11 @@ class AddressChanges:
         return own_addresses() != own
 
     async def until_other_than(self, own: Sequence[IPv4Interface]) -> None:
-        """Wait until they change, or are others than `own`."""
+        """Wait until the addresses change or differ from `own`."""
         while not await self.within(POLL_S, own):
             pass
 
-    def _heard(self) -> None:
+    def _on_netlink(self) -> None:
         assert self._netlink is not None
         try:
             while self._netlink.recv(65536):
@@ -217,19 +217,22 @@ class AddressChanges:
         except BlockingIOError:
             pass
         except OSError as error:
-            # More was told than the socket could keep, which tells enough.
+            # The socket's buffer overflowed: addresses changed.
             logger.debug("netlink: %s", error)
         self._changed.set()
 
 
 class Announcer:
-    """Tells where the master is, until `run` is cancelled; then it takes that back.
+    """Announce the master until `run` is cancelled, then withdraw the announcement.
 
-    Two masters of one cell on one network are two announcements: each name ends in a random number.
+    Each name ends in a random number, so that two masters of one cell on one network have two announcements.
     """
 
     def __init__(self, says: Callable[[], Announcement], host: str, port: int) -> None:
-        """`says` is asked now and then, since the cell may change; the master listens at the IP address `host`."""
+        """Take the current announcement from `says`, which is polled since the cell may change.
+
+        The master listens on `port` of the IP address `host`.
+        """
         self._says = says
         self._host = host
         self._port = port
@@ -238,29 +241,29 @@ class Announcer:
         self._name = f"{name} {number}"
 
     async def run(self) -> None:
-        """Announce for ever."""
-        told = ""
+        """Announce until cancelled."""
+        logged = ""
         with AddressChanges() as changes:
             while True:
                 own, said = own_addresses(), self._says()
-                interfaces, addresses = places(self._host, own)
+                interfaces, addresses = addresses_to_announce(self._host, own)
                 try:
                     async with _multicast(interfaces) as mdns:
                         if mdns is not None:
                             info = self._info(self._name, said, addresses)
                             await (await mdns.async_register_service(info, allow_name_change=True))
                             self._name = info.name.removesuffix(f".{SERVICE_TYPE}")
-                            where = f"announced as {self._name!r} at {', '.join(addresses)} port {self._port}"
-                            logger.log(logging.INFO if where != told else logging.DEBUG, "%s", where)
-                            told = where
-                        await self._until_moved(mdns, changes, own, said, addresses)
+                            success = f"announced as {self._name!r} at {', '.join(addresses)} port {self._port}"
+                            logger.log(logging.INFO if success != logged else logging.DEBUG, "%s", success)
+                            logged = success
+                        await self._until_addresses_change(mdns, changes, own, said, addresses)
                 except (OSError, ZeroconfError) as error:
-                    trouble = f"cannot be announced: {str(error) or type(error).__name__}"
-                    logger.log(logging.WARNING if trouble != told else logging.DEBUG, "%s", trouble)
-                    told = trouble
+                    trouble = f"the master cannot be announced: {str(error) or type(error).__name__}"
+                    logger.log(logging.WARNING if trouble != logged else logging.DEBUG, "%s", trouble)
+                    logged = trouble
                     await changes.within(POLL_S, own)
 
-    async def _until_moved(
+    async def _until_addresses_change(
         self,
         mdns: AsyncZeroconf | None,
         changes: AddressChanges,
@@ -268,7 +271,7 @@ class Announcer:
         said: Announcement,
         addresses: Sequence[str],
     ) -> None:
-        """Tell what changes of the cell, until the addresses do."""
+        """Update the announcement when the cell changes, until the addresses change."""
         while not await changes.within(POLL_S, own):
             now = self._says()
             if mdns is not None and now != said:
@@ -288,10 +291,11 @@ class Announcer:
         )
 
 
-def places(host: str, own: Sequence[IPv4Interface]) -> tuple[list[str], list[str]]:
-    """On which of our own addresses to announce who listens at `host`, and the addresses to be told.
+def addresses_to_announce(host: str, own: Sequence[IPv4Interface]) -> tuple[list[str], list[str]]:
+    """Return the own addresses to announce on, and the addresses to announce, for a server that listens at `host`.
 
-    Loopback is told only where there is nothing else, but announced on in any case: a unit may be on this machine.
+    Always announce on loopback too, since a unit may run on this machine. Announce the loopback address itself only
+    when there is no other.
     """
     ips = [str(interface.ip) for interface in own]
     outside = [ip for ip in ips if not only_loopback(ip)][:MAX_ADDRESSES]
@@ -304,11 +308,11 @@ def places(host: str, own: Sequence[IPv4Interface]) -> tuple[list[str], list[str
 
 
 class Browser:
-    """Hears of masters, for as long as the context lasts; some ten packets at first, then one in many minutes."""
+    """Browse for masters while the context lasts; some ten packets at first, then one in many minutes."""
 
     def __init__(self) -> None:
         self.changed = asyncio.Event()
-        """Somebody was heard of, or took it back."""
+        """Set when a master was announced or withdrawn."""
         self._names: dict[str, None] = {}
         self._mdns: AsyncZeroconf | None = None
         self._task: asyncio.Task[None] | None = None
@@ -325,7 +329,7 @@ class Browser:
         await asyncio.gather(self._task, return_exceptions=True)
 
     async def offers(self) -> tuple[Offer, ...]:
-        """All masters that were heard of and say where they are, by name."""
+        """Resolve all announced masters, and return the resolved ones sorted by name."""
         mdns = self._mdns
         if mdns is None:
             return ()
@@ -336,8 +340,8 @@ class Browser:
             logger.debug("announcements cannot be read: %s", error)
             return ()
         found = []
-        for info, there in zip(infos, answered, strict=True):
-            if there:
+        for info, resolved in zip(infos, answered, strict=True):
+            if resolved:
                 try:
                     addresses = info.parsed_addresses(IPVersion.V4Only)
                     found.append(offer_of(info.name, info.port, addresses, info.properties))
@@ -355,7 +359,7 @@ class Browser:
                             await changes.until_other_than(own)
                             continue
                         self._mdns = mdns
-                        browser = AsyncServiceBrowser(mdns.zeroconf, SERVICE_TYPE, handlers=[self._heard])
+                        browser = AsyncServiceBrowser(mdns.zeroconf, SERVICE_TYPE, handlers=[self._on_service])
                         try:
                             await changes.until_other_than(own)
                         finally:
@@ -367,7 +371,7 @@ class Browser:
                     self._mdns = None
                     self._names.clear()
 
-    def _heard(self, zeroconf: Zeroconf, service_type: str, name: str, state_change: ServiceStateChange) -> None:
+    def _on_service(self, zeroconf: Zeroconf, service_type: str, name: str, state_change: ServiceStateChange) -> None:
         if state_change is ServiceStateChange.Removed:
             self._names.pop(name, None)
         elif len(self._names) < MAX_OFFERS:
@@ -377,7 +381,7 @@ class Browser:
 
 @asynccontextmanager
 async def _multicast(interfaces: Sequence[str]) -> AsyncIterator[AsyncZeroconf | None]:
-    """Multicast DNS on these own addresses; None where there are none."""
+    """Open multicast DNS on these own addresses; yield None when there are none."""
     if not interfaces:
         yield None
         return

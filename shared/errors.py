@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one tree of errors that the project raises.
+"""The tree of errors that the project raises.
 
     CellwatchError
       InputError            an argument of a public call is wrong (also a ValueError)
@@ -7,26 +7,26 @@
         CellError           ... in cell.yaml
         MeshError           ... in a mesh file
         KinematicsError     ... in a robot description
-      SourceError           a camera or a recording does not deliver
-        SourceEnded         ... because it has come to its end
-      BoardError            the calibration board, as it is seen, does not tell the camera's pose
-      WireError             bytes from the network are no message of ours
-        NewerContract       ... but one of a newer master, which this unit does not understand
+      SourceError           a camera or a recording does not deliver frames
+        SourceEnded         ... because the recording has ended
+      BoardError            the camera's pose cannot be computed from the view of the board
+      WireError             bytes from the network are not a valid message
+        NewerContract       ... but one of a newer master that this unit does not support
       UplinkError           the exchange between unit and master failed
-        MasterUnreachable   ... nobody answered
-        MasterRefused       ... the master answered, and said no
-      Refusal               the master says no to a request: an HTTP status and one sentence
+        MasterUnreachable   ... no answer came
+        MasterRefused       ... the master answered with a refusal
+      Refusal               the master refuses a request: an HTTP status and one sentence
       JitCacheError         the directory for compiled kernels cannot be used
 
-Errors of libraries are mapped onto this tree where the library is called. `__main__` prints a
-CellwatchError as one line; anything else is a bug and shows its traceback.
+Calls of libraries map their errors onto this tree. `__main__` prints a CellwatchError as one line; any other
+exception is a bug and shows its traceback.
 """
 
 from __future__ import annotations
 
 
 class CellwatchError(Exception):
-    """Anything that we expected could go wrong; its text is one sentence for a person."""
+    """Base of all expected errors; the text is one sentence for a person."""
 
 
 class InputError(CellwatchError, ValueError):
@@ -38,7 +38,7 @@ class ConfigError(CellwatchError):
 
 
 class CellError(ConfigError):
-    """`cell.yaml`, or what it names, does not describe a cell."""
+    """`cell.yaml`, or a file that it names, is missing or invalid."""
 
 
 class MeshError(ConfigError):
@@ -46,7 +46,7 @@ class MeshError(ConfigError):
 
 
 class KinematicsError(ConfigError):
-    """A robot description is contradictory or uses what is not supported."""
+    """A robot description is contradictory or uses a feature that is not supported."""
 
 
 class SourceError(CellwatchError):
@@ -54,11 +54,11 @@ class SourceError(CellwatchError):
 
 
 class SourceEnded(SourceError):
-    """A recording has come to its end."""
+    """A recording has ended."""
 
 
 class BoardError(CellwatchError):
-    """The calibration board is not seen, or not well enough to tell the camera's pose; says what to do."""
+    """The view of the calibration board does not give the camera's pose; the text says what to do."""
 
 
 class WireError(CellwatchError):
@@ -66,10 +66,10 @@ class WireError(CellwatchError):
 
 
 class NewerContract(WireError):
-    """A master of a newer minor answered a registration with what this unit does not know."""
+    """A master of a newer minor answered a registration with content that this unit does not support."""
 
     def __init__(self, message: str, answer: bytes) -> None:
-        """`answer` is what it said; a part of it every minor can read."""
+        """Keep `answer`, the body received; a unit of any minor can read a part of it (`SlotAnswer`)."""
         super().__init__(message)
         self.answer = answer
 
@@ -79,21 +79,21 @@ class UplinkError(CellwatchError):
 
 
 class MasterUnreachable(UplinkError):
-    """Nobody answered at the master's address in time."""
+    """No answer came from the master's address in time."""
 
 
 class MasterRefused(UplinkError):
     """The master answered with a refusal."""
 
     def __init__(self, message: str, status: int, detail: str = "") -> None:
-        """`detail` is the sentence of the master alone."""
+        """Keep the HTTP `status`, and as `detail` only the master's own sentence."""
         super().__init__(message)
         self.status = status
         self.detail = detail
 
 
 class Refusal(CellwatchError):
-    """The master says no to a request."""
+    """The master refuses a request; `status` is the HTTP status."""
 
     def __init__(self, status: int, message: str, retry_after_s: int | None = None) -> None:
         super().__init__(message)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of which a power cut leaves all or nothing, and small documents that outlive a program in them."""
+"""Atomic writes of files, and small state documents in files.
+
+A power cut leaves the old file or the new one, never a part of either.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +18,14 @@ Parsed = TypeVar("Parsed")
 logger = logging.getLogger(__name__)
 
 STATE_MAX_BYTES = 10_000
-"""Some ten times the longest document that is kept as state; what is longer is none of ours."""
+"""About ten times the longest document that is kept as state; a longer file is not a state document of this project."""
 
 UNREADABLE = (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError)
-"""What reading and parsing a damaged document raises."""
+"""Exceptions raised when a damaged document is read and parsed."""
 
 
 def default_state_dir(program: str) -> Path:
-    """The folder where a service manager, or else the user's own conventions, want a program's state to be kept."""
+    """Return the state folder of a program: the service manager's, else the one of the XDG convention."""
     if managed := os.environ.get("STATE_DIRECTORY"):
         return Path(managed.split(":")[0])
     home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
@@ -30,34 +33,35 @@ def default_state_dir(program: str) -> Path:
 
 
 def write_whole(path: Path, content: bytes, *, synced: bool = True, contended: bool = False) -> None:
-    """Write a file whole or not at all; where it is `contended`, several processes may do so at a time.
+    """Write a file atomically.
 
-    When it is `synced` it is on the disk once this returns. Without, it is only whole for those who read it while the
-    power stays on: for what is read by another process, or checked and made anew when it is damaged.
+    `contended` allows several processes to write the file at the same time. With `synced`, the file is on the disk
+    when this returns. Without it, the write is atomic for readers only while the power stays on: use that for files
+    that only another process reads, or that are checked and written again when damaged.
 
     Raises:
-        OSError: it cannot be written; what was there stays.
+        OSError: the file cannot be written; the old content stays.
     """
     partial = path.with_suffix(f".{os.getpid()}.partial") if contended else path.with_suffix(".partial")
     _write(path, content, 0o666, None, synced, partial)
 
 
 def write_private(path: Path, content: bytes, owner: tuple[int, int] | None = None) -> None:
-    """Write a file whole or not at all, at no moment readable by others (mode 0600); on the disk once this returns.
+    """Write a file atomically with mode 0600, at no moment readable by others; it is on the disk when this returns.
 
-    `owner` is the user's and the group's number that the file is given to.
+    `owner` gives the file to this user and group number.
 
     Raises:
-        OSError: it cannot be written; what was there stays.
+        OSError: the file cannot be written; the old content stays.
     """
     _write(path, content, 0o600, owner, synced=True, partial=path.with_suffix(".partial"))
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the names of a folder's files on the disk, as fsync has their content.
+    """Flush the directory entries of `folder` to the disk, as fsync does for the content of files.
 
     Raises:
-        OSError: it cannot be opened, or the disk fails.
+        OSError: the folder cannot be opened, or the disk fails.
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -67,13 +71,13 @@ def sync_folder(folder: Path) -> None:
 
 
 class StateFile:
-    """One small JSON document in a program's state, which must do without: what goes wrong with it is a warning."""
+    """One small JSON document of a program's state. The program works without it: each failure is only a warning."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def save(self, document: dict[str, Any]) -> None:
-        """Keep `document` in place of the one before; the same one is not written again."""
+        """Replace the stored document by `document`; an equal document is not written again."""
         content = json.dumps(document).encode()
         try:
             if self._path.is_file() and self._path.read_bytes() == content:
@@ -84,9 +88,9 @@ class StateFile:
             logger.warning("%s: cannot be written: %s", self._path, error)
 
     def load(self, parse: Callable[[Any], Parsed]) -> Parsed | None:
-        """What `parse` makes of the document, or None when there is none; a damaged one is as good as none.
+        """Return the document as parsed by `parse`, or None when it is missing or damaged.
 
-        `parse` raises ValueError, KeyError, TypeError or OverflowError where the document is none of ours.
+        `parse` raises ValueError, KeyError, TypeError or OverflowError when the document is not valid.
         """
         try:
             if self._path.stat().st_size > STATE_MAX_BYTES:
@@ -95,14 +99,14 @@ class StateFile:
         except FileNotFoundError:
             return None
         except UNREADABLE as error:
-            logger.warning("%s: passed over: %s", self._path, " ".join(str(error).split()))
+            logger.warning("%s: ignored, since it cannot be read: %s", self._path, " ".join(str(error).split()))
             return None
 
     def drop(self) -> None:
-        """Forget it.
+        """Delete the document.
 
         Raises:
-            OSError: it cannot be removed.
+            OSError: the file cannot be removed.
         """
         self._path.unlink(missing_ok=True)
 
@@ -125,7 +129,7 @@ def _write(path: Path, content: bytes, mode: int, owner: tuple[int, int] | None,
 
 
 def _new(path: Path, mode: int) -> int:
-    """Open a file that nobody else has open; what was left of a write that was cut short is taken away."""
+    """Create and open a file exclusively; remove the remainder of an interrupted write."""
     try:
         return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     except FileExistsError:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot as a flat table of moving joints, out of Denavit-Hartenberg rows or a URDF.
+"""A robot as a flat table of moving joints, built from Denavit-Hartenberg rows or a URDF.
 
-Parents come first, and every fixed joint is multiplied into what hangs on it.
+Parents precede their children. Fixed joints are multiplied into the frames of their children.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from shared.transforms import Transform, from_rotation_translation, from_xyz_rpy
 from shared.urdf import UrdfJoint, UrdfModel
 
 MAX_JOINTS = 128
-"""Two arms with hands have a hundred, mimic joints counted; a longer table is a mistake."""
+"""Limit of moving joints: two arms with hands have about a hundred with mimic joints; a longer table is an error."""
 
 MAX_FRAMES = 512
-"""Links of the largest humanoid descriptions, several times over."""
+"""Limit of frames: several times the links of the largest humanoid descriptions."""
 
 BASE = -1
-"""The body that does not move: the robot's base."""
+"""Index of the body that does not move: the robot's base."""
 
 Z_AXIS = (0.0, 0.0, 1.0)
 
@@ -47,10 +47,10 @@ class DHJoint:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A moving joint of the flat table. Body k is what moves with motion k.
+    """A moving joint of the flat table; body k moves with motion k.
 
-    Its position is `multiplier * positions[dof] + offset`, in rad or m; it turns about, or shifts along,
-    the unit vector `axis` of the frame `T_parent_joint` in the body `parent`.
+    The joint's value is `multiplier * positions[dof] + offset`, in rad or m. The joint rotates about the unit vector
+    `axis`, or shifts along it. `axis` is in the joint's frame, whose pose in the body `parent` is `T_parent_joint`.
     """
 
     kind: Literal["revolute", "prismatic"]
@@ -64,7 +64,7 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Attachment:
-    """A named frame fixed in a body, with the mesh that stands in it, if any."""
+    """A named frame fixed in a body, with its mesh if it has one."""
 
     name: str
     body: int
@@ -75,10 +75,10 @@ class Attachment:
 def table_of_dh(
     name: str, joints: Sequence[DHJoint], link_meshes: Sequence[TriangleMesh | None], tool: TriangleMesh | None
 ) -> tuple[list[Motion], list[Attachment]]:
-    """The table of a serial robot; `link_meshes` has link 0 first, and the tool is in the last link's frame.
+    """Build the table of a serial robot; `link_meshes` starts with link 0, and the tool is in the last link's frame.
 
     Raises:
-        KinematicsError: the counts do not match.
+        KinematicsError: the number of meshes does not match the number of joints.
     """
     if len(link_meshes) != len(joints) + 1:
         raise KinematicsError(
@@ -111,10 +111,10 @@ def table_of_urdf(
     tool: TriangleMesh | None,
     tool_parent: str | None,
 ) -> tuple[list[str], list[Motion], list[Attachment]]:
-    """The positions' names, and the table, of the tree of a URDF; `path` is for messages.
+    """Return the names of the positions, and the table, of a URDF's tree; `path` is for messages.
 
     Raises:
-        KinematicsError: a name is not in the file, or a joint is neither listed nor held.
+        KinematicsError: the file has no joint or link of a given name, or a joint is neither listed nor held.
     """
     names = _actuated(path, model, joints, held_joints)
     motions, frames = _flatten(path, model, names, held_joints)
@@ -131,7 +131,7 @@ def table_of_urdf(
 def check_table(
     name: str, joint_names: Sequence[str], motions: Sequence[Motion], attachments: Sequence[Attachment]
 ) -> None:
-    """Raise KinematicsError where the flat table contradicts itself."""
+    """Raise KinematicsError if the flat table is inconsistent."""
     if len(motions) > MAX_JOINTS:
         raise KinematicsError(f"{name}: expected at most {MAX_JOINTS} moving joints, got {len(motions)}")
     if len(attachments) > MAX_FRAMES:
@@ -164,7 +164,7 @@ def check_table(
 
 
 def _actuated(path: str | Path, model: UrdfModel, wanted: Sequence[str] | None, held: Mapping[str, float]) -> list[str]:
-    """Names of the joints whose positions will come, in that order."""
+    """Return the names of the joints whose positions the robot reports, in that order."""
     free = [joint.name for joint in model.joints if joint.kind != "fixed" and joint.mimic is None]
     unknown = [name for name in (*(wanted or ()), *held) if name not in free]
     if unknown:
@@ -187,7 +187,7 @@ def _actuated(path: str | Path, model: UrdfModel, wanted: Sequence[str] | None, 
 def _flatten(
     path: str | Path, model: UrdfModel, names: Sequence[str], held: Mapping[str, float]
 ) -> tuple[list[Motion], dict[str, tuple[int, Transform]]]:
-    """The moving joints, and for every link its body and `T_body_link`."""
+    """Return the moving joints, and for every link its body and `T_body_link`."""
     by_name = {joint.name: joint for joint in model.joints}
     motions: list[Motion] = []
     frames = {model.root: (BASE, identity())}
@@ -202,14 +202,14 @@ def _flatten(
             motions.append(Motion(kind, body, T_body_joint, joint.axis, names.index(leader), multiplier, offset))
             frames[joint.child] = (len(motions) - 1, identity())
         else:
-            # What follows a fixed joint stands where its leader would stand at zero.
+            # A joint that mimics a fixed joint has the value for its leader at zero.
             value = multiplier * held.get(leader, 0.0) + offset
             frames[joint.child] = (body, T_body_joint @ _moved(joint, value))
     return motions, frames
 
 
 def _leader(path: str | Path, by_name: Mapping[str, UrdfJoint], joint: UrdfJoint) -> tuple[str, float, float]:
-    """The joint that is followed in the end, and by what multiplier and offset."""
+    """Return the joint at the end of a chain of mimic joints, and the total multiplier and offset."""
     multiplier, offset = 1.0, 0.0
     visited = [joint.name]
     while joint.mimic is not None:
@@ -231,7 +231,7 @@ def _moved(joint: UrdfJoint, value: float) -> Transform:
 
 
 def _last_link(path: str | Path, model: UrdfModel) -> str:
-    """The end of the one chain that passes the most moving joints."""
+    """Return the last link of the chain with the most moving joints."""
     depth = {model.root: 0}
     for joint in model.joints:
         depth[joint.child] = depth[joint.parent] + (joint.kind != "fixed")

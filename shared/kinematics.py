@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A robot's links at given joint positions (the paper's Algorithm 5).
 
-However a robot was described, by Denavit-Hartenberg rows with a mesh a link or by a URDF, it becomes the
-same flat table. A unit is sent that table as a plain document and needs neither the file nor a parser.
+Robots described by Denavit-Hartenberg rows with a mesh for each link, or by a URDF, have the same flat table. A unit
+receives this table as a plain document and needs neither the file nor a parser.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from shared.urdf import MeshKind, read_urdf
 
 @dataclass(frozen=True)
 class Link:
-    """A link that carries a mesh. `moving` is false when no actuated joint lies between the world and it."""
+    """A link with a mesh. `moving` is False when no actuated joint lies between it and the world."""
 
     name: str
     mesh: TriangleMesh
@@ -45,13 +45,15 @@ class Link:
 
 
 class LinkTable(NamedTuple):
-    """What the links' poses follow from, as flat arrays; for who must reckon them faster than `Robot.link_poses`.
+    """The links' kinematics as flat arrays, for code that must compute poses faster than `Robot.link_poses`.
 
-    Of each of J moving joints, parents first: `parent` (J,) its parent's row, `BASE` for the robot's base; `dof` (J,),
-    `multiplier` (J,), `offset` (J,) how its value follows from the positions; `is_turning` (J,); `axis` (J, 3) in its
-    own frame; `fixed`, `sine`, `versine`, `shift` (J, 4, 4), of which `T_parent_joint` is the sum, the latter three
-    times sin(q), 1 - cos(q) and q. Of each of L links: `body` (L,) the joint that it hangs on, or `BASE`; `T_body_link`
-    (L, 4, 4); `chain` (L, J), which joints move it; `corners` (L, 8, 3) of its bounding box.
+    For each of J moving joints, parents first: `parent` (J,), the row of its parent, or `BASE` for the robot's base;
+    `dof` (J,), `multiplier` (J,) and `offset` (J,), which give its value `multiplier * positions[dof] + offset`;
+    `is_turning` (J,); `axis` (J, 3) in its own frame; `fixed`, `sine`, `versine`, `shift` (J, 4, 4): its
+    `T_parent_joint` at value q is `fixed + sin(q) sine + (1 - cos(q)) versine + q shift`.
+
+    For each of L links: `body` (L,), the joint that carries it, or `BASE`; `T_body_link` (L, 4, 4); `chain` (L, J),
+    True for the joints that move it; `corners` (L, 8, 3) of its bounding box.
     """
 
     parent: NDArray[np.int64]
@@ -71,13 +73,13 @@ class LinkTable(NamedTuple):
 
 
 class Robot:
-    """Forward kinematics of a tree of joints, and the meshes that hang on it. Immutable.
+    """Forward kinematics of a tree of joints, with the meshes of its links. Immutable.
 
     Attributes:
-        name: for people.
+        name: a name for people.
         joint_names: the positions' names, in the order in which positions are given.
-        links: those frames that carry a mesh.
-        T_world_base: where the robot's base stands in the cell.
+        links: the frames with a mesh.
+        T_world_base: the pose of the robot's base in the cell.
     """
 
     def __init__(
@@ -118,17 +120,17 @@ class Robot:
 
     @property
     def joint_count(self) -> int:
-        """How many positions a pose takes."""
+        """The number of joint positions."""
         return len(self.joint_names)
 
     @property
     def frame_names(self) -> tuple[str, ...]:
-        """All frames that `frame_pose` knows."""
+        """The names of all frames that `frame_pose` accepts."""
         return tuple(self._frames)
 
     @property
     def link_table(self) -> LinkTable:
-        """What `link_poses` and `displacement_m` reckon with."""
+        """The arrays from which `link_poses` and `displacement_m` compute."""
         return LinkTable(
             np.array(self._parent, np.int64),
             self._dof.astype(np.int64),
@@ -147,10 +149,10 @@ class Robot:
         )
 
     def check_joints(self, joints: ArrayLike) -> NDArray[np.float64]:
-        """Return `joints` as (n,) float64.
+        """Return `joints` as an array (n,) float64.
 
         Raises:
-            InputError: not as many finite numbers as the robot has joints, or they are masked or booleans.
+            InputError: the count is wrong, or a value is not finite, masked or a boolean.
         """
         if isinstance(joints, np.ma.MaskedArray):
             raise InputError(f"joints: expected {self._expected()}, got a masked array")
@@ -168,19 +170,19 @@ class Robot:
         return positions
 
     def link_poses(self, joints: ArrayLike) -> NDArray[np.float64]:
-        """`T_base_link` (L, 4, 4) of `links` at joint positions (n,), rad or m.
+        """Return `T_base_link` (L, 4, 4) of `links` at joint positions (n,), rad or m.
 
         Raises:
-            InputError: wrong number of joints, or one is not finite.
+            InputError: the count of joints is wrong, or a value is not finite.
         """
         bodies = self._bodies(self.check_joints(joints))
         return np.asarray(bodies[self._link_body] @ self._T_body_link)
 
     def frame_pose(self, name: str, joints: ArrayLike) -> Transform:
-        """`T_base_frame` of a named frame at joint positions (n,), rad or m.
+        """Return `T_base_frame` of a named frame at joint positions (n,), rad or m.
 
         Raises:
-            InputError: no such frame, wrong number of joints, or one is not finite.
+            InputError: the frame does not exist, the count of joints is wrong, or a value is not finite.
         """
         if name not in self._frames:
             raise InputError(f"frame: expected one of {', '.join(self._frames)}, got {name}")
@@ -188,19 +190,20 @@ class Robot:
         return np.asarray(self._bodies(self.check_joints(joints))[frame.body] @ frame.T_body_frame)
 
     def displacement_m(self, joint_uncertainty_rad: ArrayLike, joints: ArrayLike) -> NDArray[np.float64]:
-        """Upper bound (L,), metres, of how far any point of each link moves when every joint is off.
+        """Return an upper bound (L,), in metres, of the motion of any point of each link under joint errors.
 
-        Turn the joints one after another from the base outwards: when a joint's turn comes, those beyond it
-        still stand at `joints`, so the distance of the link's points from its axis is known, and they move
-        by at most the chord of that circle. The sum holds for angles of any size. Distances are those of the
-        link's bounding box.
+        Consider the joints one after another from the base outwards. At the turn of one joint, the joints beyond it
+        are still at `joints`, so the distance of the link's points from its axis is known. The points move by at most
+        the chord of that circle. The sum of the chords holds for angles of any size. Distances are those of the link's
+        bounding box.
 
         Args:
-            joint_uncertainty_rad: by how much at most, a scalar or (n,), at least 0; metres for prismatic joints.
-            joints: (n,) positions.
+            joint_uncertainty_rad: largest error of the joints, a scalar or (n,), at least 0; in metres for prismatic
+                joints.
+            joints: (n,) positions, rad or m.
 
         Raises:
-            InputError: wrong number of values, negative or not finite.
+            InputError: the count of values is wrong, or a value is negative or not finite.
         """
         positions = self.check_joints(joints)
         uncertainty = np.asarray(joint_uncertainty_rad, dtype=np.float64)
@@ -234,15 +237,15 @@ class Robot:
         name: str = "robot",
         T_world_base: ArrayLike | None = None,
     ) -> Robot:
-        """A serial robot of standard Denavit-Hartenberg rows.
+        """Build a serial robot from standard Denavit-Hartenberg rows.
 
         Args:
-            joints: a row a joint, from the base outwards.
-            link_meshes: one a link in that link's frame, the base (link 0) first; None where there is none.
-            tool: in the last link's frame.
+            joints: one row for each joint, from the base outwards.
+            link_meshes: one mesh for each link in that link's frame, the base (link 0) first; None for a link without.
+            tool: a mesh in the last link's frame.
 
         Raises:
-            KinematicsError: the counts do not match, or a number is not finite.
+            KinematicsError: the count of meshes is wrong, or a number is not finite.
         """
         motions, attachments = table_of_dh(name, joints, link_meshes, tool)
         return cls(name, [row.name for row in joints], motions, attachments, T_world_base)
@@ -260,19 +263,19 @@ class Robot:
         tool_parent: str | None = None,
         T_world_base: ArrayLike | None = None,
     ) -> Robot:
-        """The robot of a URDF file.
+        """Build a robot from a URDF file.
 
         Args:
             path: the file.
-            meshes: which of its shapes stand for the links.
-            joints: actuated joints in the order in which positions will come; the chain's order when absent.
-            held_joints: actuated joints of which no position will come, and where they stand (rad or m).
+            meshes: the shapes of the file to use for the links.
+            joints: actuated joints in the order of the positions; the chain's order when None.
+            held_joints: actuated joints without reported positions, and their fixed positions (rad or m).
             packages: folders of ROS packages.
-            link_meshes: meshes (link frame) to take instead of the file's.
+            link_meshes: meshes (link frame) that replace the file's.
             tool: a mesh in the frame of the link `tool_parent`, by default the last link of the longest chain.
 
         Raises:
-            KinematicsError: the file is no usable robot, or a name is not in it; names the file.
+            KinematicsError: the file is not a usable robot, or lacks a given name; the text names the file.
             MeshError: a mesh is missing or unusable.
         """
         model = read_urdf(path, meshes, packages, link_meshes)
@@ -283,7 +286,7 @@ class Robot:
             raise KinematicsError(f"{path}: {error}") from error
 
     def document(self) -> dict[str, Any]:
-        """The robot as a plain document that names its meshes by sha256."""
+        """Return the robot as a plain document that names its meshes by sha256."""
         return {
             "name": self.name,
             "joint_names": list(self.joint_names),
@@ -312,20 +315,20 @@ class Robot:
         }
 
     def to_document(self) -> tuple[dict[str, Any], dict[str, bytes]]:
-        """The robot as a plain document, and its meshes' canonical bytes by sha256."""
+        """Return the robot as a plain document, and its meshes' canonical bytes by sha256."""
         return self.document(), {link.mesh.sha256: link.mesh.to_bytes() for link in self.links}
 
     @classmethod
     def from_document(cls, document: object, meshes: Mapping[str, bytes | TriangleMesh]) -> Robot:
-        """The robot of `to_document`, as it came over the network.
+        """Build the robot from a document of `to_document` that came over the network.
 
         Raises:
-            KinematicsError: the document is malformed or contradicts itself.
+            KinematicsError: the document is malformed or inconsistent.
             MeshError: a mesh is missing or malformed.
         """
         try:
             checked = _RobotDocument.model_validate(document)
-            # Each is read once, however many frames carry it.
+            # Each mesh is read once, even when several frames carry it.
             known = dict(meshes)
             for row in checked.frames:
                 if row.mesh is not None:
@@ -365,7 +368,7 @@ class Robot:
         return f"{self.joint_count} finite positions ({', '.join(self.joint_names)})"
 
     def _bodies(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """`T_base_body` (J + 1, 4, 4); the last one is the base itself, so that index -1 (`BASE`) finds it."""
+        """Return `T_base_body` (J + 1, 4, 4). The last is the base itself, so that index -1 (`BASE`) selects it."""
         values = self._multiplier * positions[self._dof] + self._offset
         turn = values * self._is_turning
         local = (
@@ -413,9 +416,9 @@ class _RobotDocument(BaseModel):
 
 
 def _local_terms(motions: Sequence[Motion]) -> tuple[NDArray[np.float64], ...]:
-    """Constant terms (J, 4, 4) each of `T_parent_body = fixed + sin(q) sine + (1 - cos(q)) versine + q shift`.
+    """Return constant terms (J, 4, 4) of `T_parent_body = fixed + sin(q) sine + (1 - cos(q)) versine + q shift`.
 
-    Rodrigues' formula with the joint's origin multiplied in, so that all joints are turned at once.
+    This is Rodrigues' formula multiplied by the joint's origin, so that all joints are evaluated at once.
     """
     fixed, sine, versine, shift = np.zeros((4, len(motions), 4, 4))
     for index, motion in enumerate(motions):
@@ -432,7 +435,7 @@ def _local_terms(motions: Sequence[Motion]) -> tuple[NDArray[np.float64], ...]:
 
 
 def _chain(motions: Sequence[Motion], body: int) -> set[int]:
-    """The motions between the base and a body, the body's own included."""
+    """Return the motions between the base and a body, including the body's own."""
     found: set[int] = set()
     while body != BASE:
         found.add(body)
@@ -441,7 +444,7 @@ def _chain(motions: Sequence[Motion], body: int) -> set[int]:
 
 
 def _box_corners(mesh: TriangleMesh) -> NDArray[np.float64]:
-    """The eight corners (8, 3) of a mesh's bounding box, mesh frame."""
+    """Return the eight corners (8, 3) of a mesh's bounding box, mesh frame."""
     low, high = mesh.bounds_m
     chosen = np.array(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij")).reshape(3, 8).T
     return np.where(chosen, high, low)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The voxel grid of the cell: world-aligned, one for all units.
 
-A voxel's key is `(ix * ny + iy) * nz + iz` as a little-endian uint32: what units send and the master merges.
-Indices are floored, never truncated or rounded (the paper's Algorithm 1 adds half a *length* to a
-dimensionless number); so a point on a border belongs to the voxel above it.
+A voxel's key is `(ix * ny + iy) * nz + iz` as a little-endian uint32. Units send keys and the master merges them.
+Indices are floored, never truncated or rounded (the paper's Algorithm 1 adds half a *length* to a dimensionless
+number). So a point on a border belongs to the voxel with the higher index.
 """
 
 from __future__ import annotations
@@ -17,30 +17,30 @@ from numpy.typing import ArrayLike, NDArray
 from shared.errors import InputError
 
 MAX_CELLS = 2**27
-"""A dense counter of uint32 then takes at most 512 MiB of address space on a unit."""
+"""Limit of voxels: a dense counter of uint32 then takes at most 512 MiB of address space on a unit."""
 
 MAX_AXIS = 2**15 - 1
-"""Indices travel as int16."""
+"""Limit of an axis: indices travel as int16."""
 
 MAX_INDEX = 2.0**53
-"""Up to here a float64 tells one index from the next."""
+"""Limit of an index: below it, a float64 distinguishes neighbouring integers."""
 
 NUMBERS, INTEGERS = "iuf", "iu"
-"""Kinds of numpy's dtypes: text, objects and booleans are no numbers, and a fraction is never cut off."""
+"""Kinds of numpy dtypes accepted as numbers and as integers: no text, objects or booleans; fractions are not cut."""
 
 SHOWN_CHARS = 60
-"""Enough of a wrong value to recognise it."""
+"""Maximum length of a quoted value: enough to recognise it."""
 
 MAX_BLOCKS = 2**17
-"""Of a cell's box: 16 kB of a seen report's bits before compression, and 128 KiB of the master's memory a unit."""
+"""Limit of blocks in a cell: 16 kB of uncompressed seen bits, and 128 KiB of the master's memory for each unit."""
 
 EDGE_TOLERANCE = 1e-6
-"""A box of 3.0 m at 0.1 m has 30 voxels, although 3.0 / 0.1 is 30.000000000000004 in floating point."""
+"""Tolerance of a count of voxels: 3.0 m at 0.1 m has 30 voxels, though a floating-point quotient may exceed 30."""
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Voxels of edge `voxel_size_m` from the corner `origin_m` (3,) of the world; `shape` counts them per axis."""
+    """Voxels of edge `voxel_size_m`, starting at the corner `origin_m` (3,) in the world; `shape` counts each axis."""
 
     origin_m: tuple[float, float, float]
     voxel_size_m: float
@@ -68,10 +68,10 @@ class Lattice:
 
     @classmethod
     def covering(cls, box_min_m: ArrayLike, box_max_m: ArrayLike, voxel_size_m: float) -> Lattice:
-        """The smallest lattice from `box_min_m` that covers the box up to `box_max_m`.
+        """Return the smallest lattice from `box_min_m` that covers the box up to `box_max_m`.
 
         Raises:
-            InputError: the box is empty, or it would need more than `MAX_CELLS` voxels, or these are no numbers.
+            InputError: the box is empty, needs more than `MAX_CELLS` voxels, or is not given as finite numbers.
         """
         low = _numbers(box_min_m, "box_min_m", "three finite numbers").astype(np.float64)
         high = _numbers(box_max_m, "box_max_m", "three finite numbers").astype(np.float64)
@@ -80,7 +80,7 @@ class Lattice:
         size = _length(voxel_size_m, "voxel_size_m")
         with np.errstate(over="ignore"):
             counts = np.ceil((high - low) / size - EDGE_TOLERANCE)
-        # Both ends fit an int64; a number of voxels near the upper one is refused below.
+        # 2**53 fits an int64; the constructor refuses any count near it.
         counts = np.clip(counts, 1, 2**53).astype(np.int64)
         return cls(
             (float(low[0]), float(low[1]), float(low[2])),
@@ -90,15 +90,15 @@ class Lattice:
 
     @property
     def cell_count(self) -> int:
-        """How many voxels there are."""
+        """The number of voxels."""
         nx, ny, nz = self.shape
         return nx * ny * nz
 
     def index(self, points_m: NDArray[Any]) -> NDArray[np.int64]:
-        """Indices (..., 3) of the voxels that hold the world points (..., 3) in metres; not clipped to the shape.
+        """Return the indices (..., 3) of the voxels that contain world points (..., 3) in metres, not clipped.
 
         Raises:
-            InputError: these are no points of three finite numbers.
+            InputError: `points_m` are not points of three finite numbers.
         """
         points = _triples(points_m, "points_m", NUMBERS)
         with np.errstate(over="ignore"):
@@ -108,19 +108,19 @@ class Lattice:
         return found.astype(np.int64)
 
     def contains(self, indices: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which of the indices (..., 3) lie on the lattice, (...) bool.
+        """Return (...) bool: True for the indices (..., 3) that lie on the lattice.
 
         Raises:
-            InputError: these are no triples of numbers.
+            InputError: `indices` are not triples of numbers.
         """
         found = _triples(indices, "indices", NUMBERS)
         return np.asarray(((found >= 0) & (found < self.shape)).all(axis=-1))
 
     def centres(self, indices: NDArray[Any]) -> NDArray[np.float64]:
-        """World positions (..., 3) in metres of the middles of the voxels at `indices` (..., 3).
+        """Return the centres (..., 3) in metres, world frame, of the voxels at `indices` (..., 3).
 
         Raises:
-            InputError: these are no triples of numbers.
+            InputError: `indices` are not triples of numbers.
         """
         return (
             np.asarray(self.origin_m)
@@ -128,10 +128,10 @@ class Lattice:
         )
 
     def keys(self, indices: NDArray[Any]) -> NDArray[np.uint32]:
-        """Keys (N,) of indices (N, 3), in the order given.
+        """Return the keys (N,) of indices (N, 3), in the same order.
 
         Raises:
-            InputError: an index lies outside the lattice, or these are no triples of integers.
+            InputError: an index lies outside the lattice, or `indices` are not triples of integers.
         """
         found = _triples(indices, "indices", INTEGERS).astype(np.int64)
         if found.ndim != 2:
@@ -142,10 +142,10 @@ class Lattice:
         return ((found[:, 0] * ny + found[:, 1]) * nz + found[:, 2]).astype("<u4")
 
     def indices(self, keys: NDArray[Any]) -> NDArray[np.int16]:
-        """Indices (N, 3) int16 of keys (N,).
+        """Return the indices (N, 3) int16 of keys (N,).
 
         Raises:
-            InputError: a key lies outside the lattice, or these are no integers.
+            InputError: a key lies outside the lattice, or `keys` are not integers.
         """
         found = _numbers(keys, "keys", "integers", INTEGERS).astype(np.int64).reshape(-1)
         if found.size and (found.min() < 0 or found.max() >= self.cell_count):
@@ -155,9 +155,9 @@ class Lattice:
 
 
 def block_lattice(box_min_m: NDArray[np.float64], box_max_m: NDArray[np.float64], block_size_m: float) -> Lattice:
-    """The box from `box_min_m` (3,) to `box_max_m` (3,) in blocks, by which units report what they look through.
+    """Return the lattice of blocks, in which units report what they see through, of a box.
 
-    In a box that needs more than `MAX_BLOCKS`, they are twice as large as `block_size_m`, and so on.
+    The box spans `box_min_m` (3,) to `box_max_m` (3,). The block size doubles until there are at most `MAX_BLOCKS`.
 
     Raises:
         InputError: as in `Lattice.covering`.
@@ -168,7 +168,7 @@ def block_lattice(box_min_m: NDArray[np.float64], box_max_m: NDArray[np.float64]
 
 
 def _numbers(value: ArrayLike, name: str, expected: str, kinds: str = NUMBERS) -> NDArray[Any]:
-    """`value` as an array whose dtype is of one of `kinds`; an empty list has no dtype of its own."""
+    """Return `value` as an array whose dtype is of one of `kinds`; accept an empty list, whose dtype is arbitrary."""
     try:
         array = np.asarray(value)
     except (TypeError, ValueError) as error:
@@ -179,7 +179,7 @@ def _numbers(value: ArrayLike, name: str, expected: str, kinds: str = NUMBERS) -
 
 
 def _triples(value: ArrayLike, name: str, kinds: str) -> NDArray[Any]:
-    """`value` as an array (..., 3)."""
+    """Return `value` as an array (..., 3)."""
     array = _numbers(value, name, "integers" if kinds == INTEGERS else "numbers", kinds)
     if array.shape[-1:] != (3,):
         raise InputError(f"{name}: expected three values on the last axis, got shape {array.shape}")
@@ -187,7 +187,7 @@ def _triples(value: ArrayLike, name: str, kinds: str) -> NDArray[Any]:
 
 
 def _length(value: float, name: str) -> float:
-    """`value` as a positive, finite float."""
+    """Return `value` as a positive, finite float."""
     array = _numbers(value, name, "a positive length")
     if array.shape != () or not (np.isfinite(array) and array > 0.0):
         raise InputError(f"{name}: expected a positive length, got {_shown(value)}")
@@ -195,5 +195,5 @@ def _length(value: float, name: str) -> float:
 
 
 def _shown(value: object) -> str:
-    """`value` in one short line."""
+    """Return `value` in one short line."""
     return " ".join(repr(value).split())[:SHOWN_CHARS]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Triangle meshes: what CAD and robot links are rendered from.
+"""Triangle meshes of CAD and robot links, from which surfaces are rendered.
 
-A mesh is *closed* when its surface bounds a volume and its triangles turn their front outwards
-(counter-clockwise seen from outside); only then may a renderer skip the triangles that it sees from
-behind. A mesh that is not closed is kept as it is and rendered from both sides.
+A mesh is *closed* when its surface bounds a volume and its triangles face outwards (counter-clockwise from outside).
+Only then may a renderer skip the triangles that it sees from behind. A mesh that is not closed is kept unchanged and
+rendered from both sides.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from shared.errors import MeshError
 from shared.transforms import Transform
 
 MAX_TRIANGLES = 1_000_000
-"""18 MB of canonical bytes, and about a second to render on a unit; CAD exported finer than this is a mistake."""
+"""Limit of triangles: 18 MB of canonical bytes and about a second to render on a unit; finer CAD is a mistake."""
 
 FILE_SUFFIXES = (".stl", ".obj", ".dae", ".ply")
 
 MERGE_DISTANCE_M = 1e-6
-"""Vertices on the same micrometre are one: STL repeats each vertex in every triangle that meets there."""
+"""Distance below which vertices are merged; STL repeats each vertex in every triangle that uses it."""
 
 MIN_TRIANGLE_AREA_M2 = 1e-12
-"""A square micrometre covers no pixel and has no usable normal."""
+"""Least area of a triangle: a square micrometre covers no pixel and has no usable normal."""
 
 MAX_COORDINATE_M = 1000.0
-"""No cell is a kilometre wide: coordinates beyond it are a file in millimetres without its `scale`."""
+"""Limit of coordinates. No cell is a kilometre wide: larger values mean a file in millimetres without its `scale`."""
 
 CIRCLE_SEGMENTS = 48
-"""A cylinder of 0.1 m radius is then nowhere more than 0.2 mm inside the true one."""
+"""Segments of a circle: a cylinder of 0.1 m radius is then at most 0.2 mm inside the true surface."""
 
 _BOX_CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _BOX_FACES = np.array((
     (1, 3, 0), (4, 1, 0), (0, 3, 2), (2, 4, 0), (1, 7, 3), (5, 1, 4),
     (5, 7, 1), (3, 7, 2), (6, 4, 2), (2, 7, 6), (6, 5, 4), (7, 5, 6),
 ))  # fmt: skip
-"""A unit rehearses with boxes, and need not pay for imports either."""
+"""Corners and faces of a box, written out: the warm-up of a unit uses boxes without importing trimesh."""
 
 _HEADER = struct.Struct("<4sIII")
 _MAGIC = b"CWM1"
@@ -55,10 +55,10 @@ class TriangleMesh:
     """Triangles in metres. The arrays are read-only.
 
     Attributes:
-        name: for messages; no part of the canonical bytes.
+        name: a name for messages; not part of the canonical bytes.
         vertices: (V, 3) float32, metres, mesh frame.
         faces: (F, 3) int32, indices into `vertices`.
-        closed: it bounds a volume and all its triangles face outwards.
+        closed: True if the mesh bounds a volume and all its triangles face outwards.
     """
 
     name: str
@@ -98,20 +98,20 @@ class TriangleMesh:
 
     @classmethod
     def of_triangles(cls, name: str, vertices: NDArray[Any], faces: NDArray[Any]) -> TriangleMesh:
-        """A mesh of raw triangles: vertices merged, flat triangles dropped, `closed` found out.
+        """Build a mesh from raw triangles: merge vertices, drop flat triangles, determine `closed`.
 
         Args:
-            name: for messages.
+            name: a name for messages.
             vertices: (V, 3) metres, any float dtype.
             faces: (F, 3) indices into `vertices`.
 
         Raises:
-            MeshError: nothing is left, or a number is not finite or out of range.
+            MeshError: no triangle is left, or a number is not finite or out of range.
         """
         raw = cls(name, np.asarray(vertices), np.asarray(faces), closed=False)
         merged, corner = _merge_vertices(raw.vertices)
         triangles = corner[raw.faces]
-        # Judged before flat triangles go: a flat one may be all that joins two neighbours.
+        # Before flat triangles are dropped: a flat one may be the only connection between two neighbours.
         closed = _bounds_volume(triangles)
         points = merged.astype(np.float64)
         if closed:
@@ -126,17 +126,17 @@ class TriangleMesh:
 
     @cached_property
     def bounds_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Smallest and largest corner (3,) each, metres, mesh frame."""
+        """Lower and upper corner (3,) of the bounding box, metres, mesh frame."""
         points = self.vertices.astype(np.float64)
         return points.min(axis=0), points.max(axis=0)
 
     @cached_property
     def sha256(self) -> str:
-        """Hash of the canonical bytes, as hex: equal geometry, equal hash."""
+        """Hash of the canonical bytes as hex: equal geometry has an equal hash."""
         return hashlib.sha256(self.to_bytes()).hexdigest()
 
     def to_bytes(self) -> bytes:
-        """The canonical bytes: a header of `CWM1`, closed, V, F (little-endian), then vertices and faces."""
+        """Return the canonical bytes: a header of `CWM1`, closed, V, F (little-endian), then vertices and faces."""
         return b"".join(
             (
                 _HEADER.pack(_MAGIC, int(self.closed), len(self.vertices), len(self.faces)),
@@ -147,10 +147,10 @@ class TriangleMesh:
 
     @classmethod
     def from_bytes(cls, data: bytes, name: str) -> TriangleMesh:
-        """Read canonical bytes, as they came over the network.
+        """Read canonical bytes that came over the network.
 
         Raises:
-            MeshError: they are no mesh of ours, cut off, too many, or hold an index or number out of range.
+            MeshError: the bytes are not a mesh, cut off or too many, or hold an index or number out of range.
         """
         if len(data) < _HEADER.size:
             raise MeshError(f"mesh {name}: expected at least {_HEADER.size} bytes, got {len(data)}")
@@ -167,13 +167,13 @@ class TriangleMesh:
         return cls(name, vertices, faces, bool(closed))
 
     def transformed(self, T_new_mesh: Transform) -> TriangleMesh:
-        """The same triangles in another frame."""
+        """Return the same triangles in another frame."""
         points = self.vertices.astype(np.float64) @ T_new_mesh[:3, :3].T + T_new_mesh[:3, 3]
         return TriangleMesh(self.name, points.astype(np.float32), self.faces, self.closed)
 
 
 def concatenated(name: str, meshes: list[TriangleMesh]) -> TriangleMesh:
-    """One mesh of several in one frame; closed when all of them are. Vertices are not merged across them."""
+    """Join meshes of one frame; closed when all of them are. Vertices of different meshes are not merged."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return TriangleMesh(
         name,
@@ -186,16 +186,16 @@ def concatenated(name: str, meshes: list[TriangleMesh]) -> TriangleMesh:
 def load_mesh(path: str | Path, scale: float | Sequence[float] = 1.0, name: str | None = None) -> TriangleMesh:
     """Read an STL, OBJ, DAE or PLY file.
 
-    Scenes of several parts become one mesh by their own transforms. COLLADA's unit is applied and its
-    up axis ignored, as RViz does.
+    The parts of a scene become one mesh by their own transforms. COLLADA's unit of length is applied and its up axis
+    ignored, as RViz does.
 
     Args:
         path: the file.
-        scale: metres per unit of the file, one number or one an axis (0.001 for a file in millimetres).
-        name: for messages; the file's stem when absent.
+        scale: metres per unit of the file, one number or one for each axis (0.001 for a file in millimetres).
+        name: a name for messages; the file's stem when None.
 
     Raises:
-        MeshError: the file is missing, unreadable, of another kind, or holds no usable triangle; names the file.
+        MeshError: the file is missing, unreadable, of another kind, or has no usable triangle; the text names the file.
     """
     file = Path(path)
     factors = np.asarray(scale, dtype=np.float64)
@@ -204,12 +204,12 @@ def load_mesh(path: str | Path, scale: float | Sequence[float] = 1.0, name: str 
     if file.suffix.lower() not in FILE_SUFFIXES:
         raise MeshError(f"{file}: expected a mesh file ({', '.join(FILE_SUFFIXES)}), got {file.suffix or file.name!r}")
     if not file.is_file():
-        raise MeshError(f"{file}: expected a mesh file, got {'a folder' if file.is_dir() else 'nothing there'}")
+        raise MeshError(f"{file}: expected a mesh file, got {'a folder' if file.is_dir() else 'no such file'}")
     vertices, faces = _read_triangles(file)
     if not len(faces):
         raise MeshError(f"{file}: expected a mesh with triangles, got none: the file is empty or damaged")
     if np.prod(np.broadcast_to(factors, 3)) < 0.0:
-        # A mirrored solid is inside out unless its triangles turn as well.
+        # Mirroring turns a solid inside out; reversing its triangles turns it back.
         faces = faces[:, ::-1]
     try:
         return TriangleMesh.of_triangles(name or file.stem, vertices * factors, faces)
@@ -218,10 +218,10 @@ def load_mesh(path: str | Path, scale: float | Sequence[float] = 1.0, name: str 
 
 
 def mesh_by_hash(meshes: Mapping[str, bytes | TriangleMesh], sha256: str, name: str) -> TriangleMesh:
-    """The mesh `name` out of canonical bytes, or meshes read before, that are filed under their hashes.
+    """Return the mesh `name` from canonical bytes, or meshes already read, keyed by their hashes.
 
     Raises:
-        MeshError: it is missing, its bytes have another hash, or they are malformed.
+        MeshError: the mesh is missing, or its bytes are malformed or have another hash.
     """
     if sha256 not in meshes:
         raise MeshError(f"mesh {name}: expected bytes with sha256 {sha256}, got none")
@@ -233,17 +233,17 @@ def mesh_by_hash(meshes: Mapping[str, bytes | TriangleMesh], sha256: str, name: 
 
 
 def box_mesh(name: str, size_m: ArrayLike) -> TriangleMesh:
-    """A box about the origin, `size_m` (3,) its edges."""
+    """Return a box centred at the origin with edges `size_m` (3,)."""
     return TriangleMesh.of_triangles(name, _BOX_CORNERS * np.asarray(size_m, dtype=np.float64), _BOX_FACES)
 
 
 def cylinder_mesh(name: str, radius_m: float, length_m: float) -> TriangleMesh:
-    """A cylinder about the origin along z."""
+    """Return a cylinder along z, centred at the origin."""
     return _primitive(name, "cylinder", radius=radius_m, height=length_m, sections=CIRCLE_SEGMENTS)
 
 
 def sphere_mesh(name: str, radius_m: float) -> TriangleMesh:
-    """A sphere about the origin."""
+    """Return a sphere centred at the origin."""
     return _primitive(name, "icosphere", subdivisions=3, radius=radius_m)
 
 
@@ -255,8 +255,8 @@ def _primitive(name: str, kind: str, **sizes: Any) -> TriangleMesh:
 
 
 def _read_triangles(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices and faces of all parts of a file, in the file's unit (COLLADA: metres)."""
-    # Half a second of imports, which a unit need not pay: it is sent its meshes as bytes.
+    """Return vertices and faces of all parts of a file, in the file's unit of length (COLLADA: metres)."""
+    # The import takes half a second; a unit, which receives its meshes as bytes, does not need it.
     import trimesh
 
     try:
@@ -264,7 +264,7 @@ def _read_triangles(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]
         parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
         is_collada = file.suffix.lower() == ".dae"
         unit_m = trimesh.units.unit_conversion(scene.units, "meters") if is_collada and scene.units else 1.0
-    # The readers raise whatever the damage happens to lead to: struct, index, value, XML and import errors.
+    # Damaged files raise many kinds of errors in the readers: struct, index, value, XML and import errors.
     except Exception as error:
         raise MeshError(f"{file}: expected a readable mesh, got {type(error).__name__}: {error}") from error
     vertices = [np.asarray(part.vertices, dtype=np.float64) * unit_m for part in parts]
@@ -276,7 +276,7 @@ def _read_triangles(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]
 
 
 def _merge_vertices(vertices: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Distinct vertices (W, 3), and for each given one (V,) the index of its own."""
+    """Return distinct vertices (W, 3), and for each given vertex (V,) its index among them."""
     rounded = np.round(vertices.astype(np.float64) / MERGE_DISTANCE_M).astype(np.int64)
     order = np.lexsort((rounded[:, 2], rounded[:, 1], rounded[:, 0]))
     is_new = np.ones(len(order), dtype=bool)
@@ -287,7 +287,7 @@ def _merge_vertices(vertices: NDArray[np.float32]) -> tuple[NDArray[np.float32],
 
 
 def _bounds_volume(faces: NDArray[np.int64]) -> bool:
-    """Whether each edge is walked as often one way as the other, so that no surface ends or turns over."""
+    """Return True if each edge has as many uses in one direction as in the other: no surface ends or flips."""
     edges = np.concatenate((faces[:, (0, 1)], faces[:, (1, 2)], faces[:, (2, 0)]))
     edges = edges[edges[:, 0] != edges[:, 1]]
     low, high = edges.min(axis=1), edges.max(axis=1)
@@ -299,7 +299,7 @@ def _bounds_volume(faces: NDArray[np.int64]) -> bool:
 
 
 def _face_outwards(points: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Turn over the parts of a closed surface whose volume comes out negative."""
+    """Reverse the triangles of those parts of a closed surface whose volume is negative."""
     part = _connected_parts(len(points), faces)[faces[:, 0]]
     a, b, c = (points[faces[:, k]] for k in range(3))
     six_volumes = np.bincount(part, weights=np.einsum("ij,ij->i", a, np.cross(b, c)))
@@ -307,13 +307,13 @@ def _face_outwards(points: NDArray[np.float64], faces: NDArray[np.int64]) -> NDA
 
 
 def _connected_parts(vertex_count: int, faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """A label (V,) for each vertex, equal where triangles connect them."""
+    """Return a label (V,) for each vertex; vertices connected by triangles have equal labels."""
     label = np.arange(vertex_count)
     while True:
         lowest = label[faces].min(axis=1)
         spread = label.copy()
         np.minimum.at(spread, faces.ravel(), np.repeat(lowest, 3))
-        # Following each label to its own label halves the remaining way, so that long parts take few rounds.
+        # Replacing each label by its label's label halves the remaining distance: long parts need few rounds.
         spread = np.minimum(spread, spread[spread])
         if np.array_equal(spread, label):
             return label

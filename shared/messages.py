@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What units, master, robot and operators say to each other.
+"""Messages between units, master, robot and operators.
 
-Times are integers of nanoseconds: `_at_ns` of a unit by its CLOCK_MONOTONIC, of the master and of
-joints by the master's. Every text, list and array is bounded, since anyone on the network may send one.
+Times are integers of nanoseconds. `_at_ns` of a unit is on its CLOCK_MONOTONIC, of the master and of joints on the
+master's. Every text, list and array is bounded, since anyone on the network can send one.
 
 The contract has a major and a minor number. Within a major, a unit works with any master whose minor is at least its
-own, so a master is updated before its units. What that asks of whoever changes this file:
+own, so a master is updated before its units. Rules for changes of this file:
 
-    requests        get new names with defaults; a unit sends them to no master that is older, for none takes it in
-    answers         `Answer`: the names beside settings, lattice, cell, pose, joints and commands are status, and a
-                    unit ignores those that it does not know; nothing that a unit must obey is put there
-    what is obeyed  settings, lattice, cell, pose, joints, commands: a unit refuses names that it does not know, since
-                    it would filter where it must not, and tells so as its trouble `contract`. So a master leaves new
-                    names out where nothing uses them, and asks a unit for no verb that its minor does not have
-    rows            of values without names are longer at their end: a unit ignores what is beyond those it knows, a
-                    master takes a shorter row as one whose last values are at their defaults
-    defaults        never change, since what is at its default may not travel
+    requests   New names have defaults. A unit does not send them to an older master, which would reject them.
+    answers    `Answer`: the names beside settings, lattice, cell, pose, joints and commands are status. A unit ignores
+               unknown status names, so nothing that changes a unit's behaviour may be status.
+    behaviour  Settings, lattice, cell, pose, joints, commands: a unit refuses unknown names, since it would filter
+               pixels that it must not, and reports the trouble `contract`. So a master omits new names that nothing
+               uses, and sends a unit no verb that its minor does not have.
+    rows       Rows are values without names. They grow at their end: a unit ignores values beyond those it knows, and
+               a master reads a shorter row as one whose last values are at their defaults.
+    defaults   Defaults never change, since a value at its default may be omitted.
 
-What each minor said is recorded in `tests/shared/golden`, and stays as it is.
+`tests/shared/golden` records the messages of each minor; these records never change.
 """
 
 from __future__ import annotations
@@ -44,42 +44,42 @@ from shared.timebase import Exchange
 from shared.transforms import Transform, validated
 
 CONTRACT_VERSION = 5
-"""The major number: rises when a unit of the old contract and a master of the new one can no longer work together."""
+"""Major number: rises when units of the old contract and masters of the new one can no longer work together."""
 
 CONTRACT_MINOR = 1
-"""Rises with each addition, at most once a release. 5.0 had no outcome codes, no trouble codes and no progress."""
+"""Minor number: rises with additions, at most once a release. 5.0 had no outcome codes, trouble codes and progress."""
 
 MAX_TEXT = 200
-"""Enough for a serial, a version or one sentence; keeps tables and logs readable."""
+"""Limit of a text: enough for a serial, a version or one sentence; keeps tables and logs readable."""
 
 MAX_JOINTS = 32
-"""More than two arms on a track with grippers have."""
+"""Limit of joints: more than two arms on a track with grippers."""
 
 MAX_JOINT_VALUE = 1e4
-"""Of a position in rad or m, or a velocity: 1600 turns. No robot is there, and on the wire it must fit a float32."""
+"""Limit of a position in rad or m, or a velocity. 1600 turns are beyond any robot, and the value fits a float32."""
 
 MAX_VOXELS = 2**18
-"""In one update: a wall that is in no CAD, 5 m by 5 m at 10 mm, still fits; 1 MiB on the wire."""
+"""Limit of voxels in one update, 1 MiB on the wire: a wall of 5 m by 5 m outside the CAD at 10 mm still fits."""
 
 MAX_SEEN_BYTES = 4096
-"""Of one seen report, compressed; coarser blocks are reported when it would be more."""
+"""Limit of one seen report, compressed; units report coarser blocks when it would be larger."""
 
 MAX_COMMANDS = 16
-"""Pending for one unit; an operator who clicks on is told to wait."""
+"""Limit of pending commands for one unit; the master refuses more until some have ended."""
 
 MAX_JOINT_SAMPLES = 32
-"""In one answer: a slow unit at 5 fps gets all that it needs at one sample in 8 ms."""
+"""Limit of joint samples in one answer: a slow unit at 5 fps gets all it needs at one sample in 8 ms."""
 
 
 PICTURE_RANGE_M = (0.3, 6.0)
-"""What the colours of all units' pictures span: from what is nearest to a camera to the far wall of its cell."""
+"""Depth range of the colours in all units' images: from the least range of a camera to the far wall of its cell."""
 
 MAX_IMAGE_BYTES = 2**22
-"""Of one picture: 1280 x 720 in three colours has 2.8 MB even when nothing of it can be compressed."""
+"""Limit of one image: 1280 x 720 in three colours has 2.8 MB even when nothing can be compressed."""
 
 
 def is_newer(contract: object, minor: object) -> bool:
-    """Return True if this is the contract, by its two numbers, of a program that is newer than this one."""
+    """Return True if these numbers are of a newer contract than this program's."""
     if not isinstance(contract, int) or not isinstance(minor, int):
         return False
     return (contract, minor) > (CONTRACT_VERSION, CONTRACT_MINOR)
@@ -87,7 +87,7 @@ def is_newer(contract: object, minor: object) -> bool:
 
 def _printable(text: str) -> str:
     if not text.isprintable():
-        raise ValueError("expected printable characters only, since it is written into logs")
+        raise ValueError("expected only printable characters, since logs show the text")
     return text
 
 
@@ -98,7 +98,7 @@ Counter = Annotated[int, Field(ge=0, lt=2**63)]
 Minor = Annotated[int, Field(ge=0, lt=2**31)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 JointValues = Annotated[tuple[float, ...], Field(max_length=MAX_JOINTS)]
-# Strict, for true is no angle.
+# Strict, since a boolean is not an angle.
 JointNumber = Annotated[float, Field(strict=True, ge=-MAX_JOINT_VALUE, le=MAX_JOINT_VALUE)]
 JointNumbers = Annotated[tuple[JointNumber, ...], Field(max_length=MAX_JOINTS)]
 Matrix = tuple[
@@ -112,15 +112,16 @@ State = Literal["uncalibrated", "live", "stale", "blind", "moved"]
 Verb = Literal["learn_background", "drop_background", "calibrate", "refine", "image"]
 ImageKind = Literal["depth", "expected", "foreground"]
 PoseOrigin = Literal["configured", "board", "refined", "operator", "source"]
-ToldOrigin = Literal["configured", "source"]
+ReportedOrigin = Literal["configured", "source"]
 TroubleCode = Literal["camera", "board", "background", "joints", "frame", "contract"]
-"""
-camera      it delivers no frames
-board       the camera's pose is not known, and the board is looked for
-background  it is being learned
-joints      where the robot is, is not known, and no frame can do without
-frame       cannot be processed with this cell, pose and settings
-contract    the master asks what this unit's minor does not know; update the unit
+"""Trouble of a unit:
+
+camera      the camera delivers no frames
+board       the camera's pose is not known; the unit searches for the board
+background  the unit learns the background
+joints      the robot's position is not known, and no frame can be processed without it
+frame       the unit cannot process frames with this cell, pose and settings
+contract    the master requires what this unit's minor does not support; update the unit
 """
 ReasonCode = Literal[
     TroubleCode,
@@ -131,32 +132,36 @@ ReasonCode = Literal[
     "pose_differs", "warning",
     "not_seen", "no_unit", "robot_silent", "robot_stale",
 ]  # fmt: skip
-"""Why a unit is in its state, or the map not complete: what units tell as their trouble (`trouble`: one of contract
-5.0, which has no codes), then by the states uncalibrated, stale, blind and moved, live with a warning; then the map."""
-OutcomeCode = Literal["done", "refused", "failed", "superseded", "unanswered"]
+"""Reason for a unit's state, or for an incomplete map.
+
+In order: troubles of units (`trouble`: a trouble of contract 5.0, which has no codes); the states uncalibrated, stale,
+blind and moved; live with a warning; the map.
 """
+OutcomeCode = Literal["done", "refused", "failed", "superseded", "unanswered"]
+"""Outcome of a command:
+
 done        carried out
-refused     cannot be done as things are; nothing was tried
-failed      tried, and nothing is changed
-superseded  void, by what was asked or came about later
-unanswered  the unit did not answer in its time
+refused     not possible in the present state; nothing was tried
+failed      tried without success; nothing changed
+superseded  made void by a later command or event
+unanswered  the unit did not answer in time
 """
 
 
 class Message(BaseModel):
-    """Frozen; unknown names, NaN and infinity are refused."""
+    """Base of messages: frozen; unknown names, NaN and infinity are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Answer(Message):
-    """A message that one who is older may read: unknown names are ignored, those of what it holds are not."""
+    """A message that an older receiver may read: its own unknown names are ignored, those of its parts refused."""
 
     model_config = ConfigDict(extra="ignore")
 
 
 class Versions(Answer):
-    """Counters of the master that rise with each change; a unit tells which ones it works with."""
+    """Counters of the master that rise with each change; a unit reports the versions that it works with."""
 
     settings: Counter = 0
     lattice: Counter = 0
@@ -173,34 +178,34 @@ class LatticeDescription(Message):
 
     @classmethod
     def of(cls, lattice: Lattice) -> LatticeDescription:
-        """Describe a lattice."""
+        """Describe `lattice`."""
         return cls(origin_m=lattice.origin_m, voxel_size_m=lattice.voxel_size_m, shape=lattice.shape)
 
     def lattice(self) -> Lattice:
-        """The lattice described.
+        """Return the lattice described.
 
         Raises:
-            InputError: there can be no such lattice.
+            InputError: the numbers do not describe a valid lattice.
         """
         return Lattice(self.origin_m, self.voxel_size_m, self.shape)
 
 
 class CellReference(Message):
-    """Which cell the master watches; `sha256` of its document, by which a unit keeps it on disk."""
+    """The cell that the master watches. `sha256` is of its document; a unit caches the cell on disk by it."""
 
     name: Text
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
 class CellAnswer(Message):
-    """What a change of the cell led to: the cell that is watched now, and the versions that units must work with."""
+    """Answer to a change of the cell: the cell watched now, and the versions that units must work with."""
 
     cell: CellReference
     versions: Versions
 
 
 class ObjectPoseRequest(Message):
-    """Where a known object stands now: `T_world_object` (4, 4), its mesh's frame in the world."""
+    """Pose of a known object: `T_world_object` (4, 4), its mesh's frame in the world."""
 
     T_world_object: Matrix
 
@@ -212,7 +217,7 @@ class ObjectPoseRequest(Message):
 
 
 class JointSample(NamedTuple):
-    """The robot's joints at one time by the master's clock: positions (n,) rad (m if prismatic), velocities per s."""
+    """The robot's joints at one time of the master's clock: positions (n,), rad or m, and velocities, per second."""
 
     at_ns: Nanoseconds
     positions: JointValues
@@ -220,23 +225,23 @@ class JointSample(NamedTuple):
 
 
 class Command(Message):
-    """Something that a unit is asked to do; it tells the outcome under the same `id` in a later update."""
+    """A command to a unit; the unit reports the outcome under the same `id` in a later update."""
 
     id: Counter
     verb: Verb
-    image: ImageKind | None = Field(default=None, description="With the verb `image`: which one.")
-    raw: bool = Field(default=False, description="With the verb `image`: 16 bits in units of depth_scale, no colours.")
+    image: ImageKind | None = Field(default=None, description="Kind of the image, for the verb `image`.")
+    raw: bool = Field(default=False, description="For the verb `image`: 16 bits in units of depth_scale, not colours.")
 
 
 class Outcome(NamedTuple):
-    """What became of a command: a code for programs, and for people what it gained, or why it was not carried out."""
+    """Outcome of a command: a code for programs, and for people the result, or the reason why it failed."""
 
     code: OutcomeCode
     detail: Text = ""
 
     @property
     def sentence(self) -> str:
-        """`done`, whatever it gained, or why not."""
+        """`done` for a command carried out, else the reason."""
         return self.code if self.code == "done" else self.detail
 
 
@@ -244,7 +249,7 @@ DONE = Outcome("done")
 
 
 class Ended(NamedTuple):
-    """A command that came to an end, as it travels: units of contract 5.0 have no code, and say `done` in the text."""
+    """A command's outcome as it travels. Units of contract 5.0 have no code; their text starts with `done`."""
 
     id: Counter
     text: Text
@@ -252,38 +257,38 @@ class Ended(NamedTuple):
 
     @classmethod
     def of(cls, command_id: int, outcome: Outcome) -> Ended:
-        """The command of this id with its outcome; a detail that is too long is cut."""
+        """Combine a command's id with its outcome; cut a detail that is too long."""
         return cls(command_id, outcome.detail[:MAX_TEXT], outcome.code)
 
     @property
     def outcome(self) -> Outcome:
-        """What became of it, whichever contract the unit speaks."""
+        """The outcome, for any minor of the unit."""
         if self.code is not None:
             return Outcome(self.code, self.text)
-        head, _, gained = self.text.partition(": ")
-        return Outcome("done", gained) if head == "done" else Outcome("failed", self.text)
+        head, _, result = self.text.partition(": ")
+        return Outcome("done", result) if head == "done" else Outcome("failed", self.text)
 
 
 class InitializeRequest(Message):
-    """A unit with its camera asks for its slot (Algorithm 8)."""
+    """Registration of a unit with its camera for a slot (Algorithm 8)."""
 
     contract: int = Field(ge=0, lt=2**31)
-    contract_minor: Minor = Field(default=0, description="Units of 5.0 have none.")
+    contract_minor: Minor = Field(default=0, description="Units of 5.0 send none.")
     serial: Label = Field(min_length=1, description="Serial number of the camera.")
     model: Label = ""
     intrinsics: Intrinsics
     software: Label = ""
-    boot_id: Label = Field(default="", description="Changes when the unit's monotonic clock starts anew.")
+    boot_id: Label = Field(default="", description="Changes when the unit's monotonic clock restarts.")
     T_world_camera: Matrix | None = Field(
-        default=None, description="Where the unit was told that its camera is; the master may know better."
+        default=None, description="The camera's pose as the unit knows it; the master's own pose takes precedence."
     )
-    pose_origin: ToldOrigin = "configured"
+    pose_origin: ReportedOrigin = "configured"
     sent_at_ns: Nanoseconds
 
     @model_validator(mode="before")
     @classmethod
     def _known_part(cls, fields: Any) -> Any:
-        """Of a newer unit only the names known here, so that it is refused for its contract and not for a name."""
+        """Keep only known names of a newer unit's request, so that it is refused for its contract, not for a name."""
         if isinstance(fields, dict) and is_newer(fields.get("contract"), fields.get("contract_minor", 0)):
             return {name: value for name, value in fields.items() if name in cls.model_fields}
         return fields
@@ -297,7 +302,7 @@ class InitializeRequest(Message):
 
 
 class InitializeAnswer(Answer):
-    """The slot, and all that a unit needs to begin."""
+    """The slot, and everything that a unit needs to start."""
 
     id: Counter
     session: Counter
@@ -310,7 +315,7 @@ class InitializeAnswer(Answer):
     joints: tuple[JointSample, ...] = Field(default=(), max_length=MAX_JOINT_SAMPLES)
     received_at_ns: Nanoseconds
     answered_at_ns: Nanoseconds
-    contract_minor: Minor = Field(default=0, description="The master's; a unit of 5.0 is not told.")
+    contract_minor: Minor = Field(default=0, description="The master's minor; not sent to units of 5.0.")
 
 
 class SlotAnswer(Answer):
@@ -325,9 +330,9 @@ class SlotAnswer(Answer):
 
 
 class SeenReport(Message):
-    """Which blocks of the cell a frame looks through.
+    """The blocks of the cell that a frame looks through.
 
-    One bit each in C order `(ix*ny + iy)*nz + iz`, from the lattice's origin, little-endian bits, zlib.
+    One bit for each block in C order `(ix*ny + iy)*nz + iz` from the lattice's origin; little-endian bits, zlib.
     """
 
     block_size_m: float = Field(gt=0.0, le=1000.0)
@@ -341,12 +346,12 @@ class SeenReport(Message):
 
 @dataclass(frozen=True)
 class Reason:
-    """Why something is as it is: a code and named numbers for programs, a sentence for people.
+    """Reason for a state: a code and named numbers for programs, and a sentence for people.
 
-    Numbers are in the units that end their names; `unit` is the id of the unit that it is about.
+    The name of a number ends with its unit of measure; `unit` is the id of the unit concerned.
     """
 
-    # Readers pass over what a later master tells besides, also within a message that forbids it.
+    # Readers ignore additional names of a later master, also inside a message that forbids unknown names.
     __pydantic_config__ = ConfigDict(extra="ignore")
 
     code: ReasonCode
@@ -357,11 +362,11 @@ class Reason:
 _REASON = TypeAdapter(Reason)
 
 ReadReason = Annotated[Reason, BeforeValidator(_REASON.validate_python)]
-"""A reason that is read strictly, too, where only an instance would count as one."""
+"""A reason validated from its fields even in strict mode, which would accept only an instance."""
 
 
 class Progress(Message):
-    """How far a task has come: `done` of `total` frames."""
+    """Progress of a task: `done` of `total` frames."""
 
     task: Literal["background"]
     done: Counter
@@ -369,46 +374,46 @@ class Progress(Message):
 
 
 class Health(Message):
-    """How far a unit's view can be trusted, with the frame that it tells of."""
+    """Quality of a unit's view, with the number of the frame that it refers to."""
 
-    valid_share: Share = Field(default=0.0, description="Share of the pixels that measured anything.")
+    valid_share: Share = Field(default=0.0, description="Share of the pixels with a measurement.")
     agreeing_share: Share = Field(
-        default=0.0, description="Share of the measured pixels before a known static surface that fit it."
+        default=0.0, description="Share of the measured pixels on a known static surface that agree with it."
     )
     residual_share: float = Field(
-        default=0.0, ge=-1.0, le=1.0, description="Median of measured less expected depth, in parts of the margin."
+        default=0.0, ge=-1.0, le=1.0, description="Median of measured less expected depth, as a share of the margin."
     )
-    static_share: Share = Field(default=0.0, description="Share of the pixels before a known static surface.")
+    static_share: Share = Field(default=0.0, description="Share of the pixels with a known static surface.")
     process_ms: float = Field(default=0.0, ge=0.0, description="Time from a frame to its voxels.")
     frame: Counter = Field(default=0, description="Number of the frame.")
-    trouble: Text | None = Field(default=None, description="What is wrong at the unit, in one sentence.")
-    warning: Text | None = Field(default=None, description="What is worse than it need be, though it works.")
-    moved: Text | None = Field(default=None, description="Why the camera seems to stand elsewhere than its pose says.")
-    blind: Text | None = Field(default=None, description="Why the camera seems covered or dazzled.")
-    trouble_code: TroubleCode | None = Field(default=None, description="What is wrong, for programs; since 5.1.")
-    progress: Progress | None = Field(default=None, description="Of what is to be waited for; since 5.1.")
+    trouble: Text | None = Field(default=None, description="The unit's trouble, in one sentence.")
+    warning: Text | None = Field(default=None, description="A degradation of a unit that still works, in one sentence.")
+    moved: Text | None = Field(default=None, description="Reason to believe that the camera moved from its pose.")
+    blind: Text | None = Field(default=None, description="Reason to believe that the camera is covered or dazzled.")
+    trouble_code: TroubleCode | None = Field(default=None, description="The trouble, for programs; since 5.1.")
+    progress: Progress | None = Field(default=None, description="Progress of the running task; since 5.1.")
 
 
 class UpdateRequest(Message):
-    """What a unit reports of its newest frame (Algorithm 8)."""
+    """Report of a unit's newest frame (Algorithm 8)."""
 
     id: Counter
     session: Counter
     sequence: Counter
     captured_at_ns: Nanoseconds | None = Field(default=None, description="Absent: there is no frame yet.")
     sent_at_ns: Nanoseconds
-    exchange: Exchange | None = Field(default=None, description="The four times of the exchange before.")
-    versions: Versions = Field(description="What the voxels were made with.")
+    exchange: Exchange | None = Field(default=None, description="The four times of the previous exchange.")
+    versions: Versions = Field(description="Versions with which the voxels were made.")
     keys: bytes = Field(default=b"", max_length=4 * MAX_VOXELS, description="Ascending little-endian uint32.")
-    seen: SeenReport | None = Field(default=None, description="Absent: as it was in the update before.")
+    seen: SeenReport | None = Field(default=None, description="Absent: unchanged since the previous update.")
     health: Health = Health()
-    joints_until_ns: Nanoseconds = Field(default=0, description="The newest joints that the unit has.")
-    done: tuple[Ended, ...] = Field(default=(), max_length=MAX_COMMANDS, description="Commands that came to an end.")
-    phase: Phase = Field(default="live", description="How far the unit has come since it started.")
+    joints_until_ns: Nanoseconds = Field(default=0, description="Time of the newest joints that the unit has.")
+    done: tuple[Ended, ...] = Field(default=(), max_length=MAX_COMMANDS, description="Commands that ended.")
+    phase: Phase = Field(default="live", description="Phase of the unit's start.")
 
 
 class UpdateAnswer(Answer):
-    """What a unit needs next. Settings, lattice, cell and pose only where the unit's version is another."""
+    """All that a unit needs next; settings, lattice, cell and pose only when the unit's version differs."""
 
     versions: Versions
     received_at_ns: Nanoseconds
@@ -422,15 +427,15 @@ class UpdateAnswer(Answer):
 
 
 class PoseQuality(Message):
-    """How well a camera's pose is known by what it was found by; what was not measured is absent."""
+    """Accuracy of a camera's pose by the method that found it; values not measured are absent."""
 
     uncertainty_mm: float | None = Field(default=None, ge=0.0, description="Standard error of its position.")
     uncertainty_deg: float | None = Field(default=None, ge=0.0, description="Standard error of its rotation.")
-    reprojection_px: float | None = Field(default=None, ge=0.0, description="RMS, where it was found by the board.")
+    reprojection_px: float | None = Field(default=None, ge=0.0, description="RMS, for a pose from the board.")
 
 
 class PoseRequest(Message):
-    """Where a unit's camera is: `T_world_camera` (4, 4), optical frame."""
+    """Pose of a unit's camera: `T_world_camera` (4, 4), optical frame."""
 
     T_world_camera: Matrix
     origin: PoseOrigin = "operator"
@@ -444,21 +449,21 @@ class PoseRequest(Message):
 
 
 class PoseAnswer(Message):
-    """The version that the pose has now."""
+    """The new version of the pose."""
 
     pose: Counter
 
 
 class JointsRequest(Message):
-    """`PUT /robot/joints`: positions in rad (m if prismatic); without a time they count from their arrival."""
+    """`PUT /robot/joints`: positions in rad (m if prismatic); without a time, the time of arrival counts."""
 
     positions: JointNumbers
     velocities: JointNumbers | None = None
-    at_ns: Nanoseconds | None = Field(default=None, description="By the master's clock, see `GET /robot`.")
+    at_ns: Nanoseconds | None = Field(default=None, description="On the master's clock, see `GET /robot`.")
 
 
 class RobotAnswer(Message):
-    """`GET /robot`: `fresh`, `stale` (silent for too long), `silent` (never reported), or `none` in this cell."""
+    """`GET /robot`: `fresh`, `stale` (no recent report), `silent` (never reported), or `none` (no robot)."""
 
     state: Literal["fresh", "stale", "silent", "none"]
     reason: Text = ""
@@ -469,18 +474,18 @@ class RobotAnswer(Message):
 
 
 class CommandRow(Answer):
-    """The last thing that an operator asked of a unit."""
+    """The last command of an operator to a unit."""
 
     id: Counter
     verb: Verb
-    outcome: Text | None = Field(description="`done`, or why not; absent while the unit is at it.")
-    code: OutcomeCode | None = Field(default=None, description="The same for programs.")
-    detail: Text = Field(default="", description="What it gained, or why it was not carried out.")
+    outcome: Text | None = Field(description="`done`, or the reason; absent while the command runs.")
+    code: OutcomeCode | None = Field(default=None, description="The outcome, for programs.")
+    detail: Text = Field(default="", description="The result, or the reason why it failed.")
 
     def ended(self, outcome: Outcome) -> CommandRow:
-        """The same, come to its end."""
-        told = {"outcome": outcome.sentence, "code": outcome.code, "detail": outcome.detail}
-        return self.model_copy(update=told)
+        """Return a copy of the row with the command's outcome."""
+        ending = {"outcome": outcome.sentence, "code": outcome.code, "detail": outcome.detail}
+        return self.model_copy(update=ending)
 
 
 class UnitRow(Answer):
@@ -493,10 +498,10 @@ class UnitRow(Answer):
     software: str
     state: State
     reason: str
-    cause: ReadReason | None = Field(default=None, description="The reason for programs; absent where there is none.")
-    phase: Phase = Field(default="live", description="How far it has come: registering, fetching, localising, live.")
-    age_s: float | None = Field(description="Since the capture of its last frame.")
-    arrival_age_s: float | None = Field(description="Since its last update arrived.")
+    cause: ReadReason | None = Field(default=None, description="The reason, for programs; absent when there is none.")
+    phase: Phase = Field(default="live", description="Phase of its start: registering, fetching, localising, live.")
+    age_s: float | None = Field(description="Age of its last frame, since the capture.")
+    arrival_age_s: float | None = Field(description="Age of its last update, since the arrival.")
     clock_uncertainty_ms: float | None
     fps: float
     voxels: int
@@ -504,31 +509,31 @@ class UnitRow(Answer):
     frame_number: int
     health: Health
     T_world_camera: Matrix | None
-    pose_origin: PoseOrigin | None = Field(default=None, description="Who said where the camera is.")
+    pose_origin: PoseOrigin | None = Field(default=None, description="Origin of the camera's pose.")
     pose_quality: PoseQuality = PoseQuality()
     intrinsics: Intrinsics | None = Field(
-        default=None, description="Of its camera, as it told them when it registered; absent until it did."
+        default=None, description="Intrinsics of its camera from its registration; absent before."
     )
     range_m: float | None = Field(
-        default=None, description="How far before its camera the farthest block of the cell lies that it looks through."
+        default=None, description="Distance from its camera to the farthest block of the cell that it looks through."
     )
     versions: Versions
     contract_minor: int | None = Field(
-        default=None, description="Of the contract that the unit speaks; absent until it registered with this master."
+        default=None, description="Minor of the unit's contract; absent until it registers with this master."
     )
     last_command: CommandRow | None = None
 
 
 class VoxelsAnswer(Answer):
-    """`GET /voxels`: the merged map. `voxels` are indices (N, 3), centres (N, 3) in m or keys (N,), as asked for."""
+    """`GET /voxels`: the merged map. `voxels` are indices (N, 3), centres (N, 3) in m or keys (N,), as requested."""
 
     lattice: LatticeDescription
     lattice_version: Counter
     voxels: list[Any]
-    witnesses: list[int] = Field(description="How many live units report each voxel.")
-    complete: bool = Field(description="False whenever a voxel's absence proves nothing.")
-    reasons: list[str] = Field(description="Why it is not complete.")
-    causes: list[Reason] = Field(default=[], description="The same for programs, in the same order.")
+    witnesses: list[int] = Field(description="Number of live units that report each voxel.")
+    complete: bool = Field(description="False when the absence of a voxel does not prove free space.")
+    reasons: list[str] = Field(description="Reasons why the map is not complete.")
+    causes: list[Reason] = Field(default=[], description="The reasons for programs, in the same order.")
     oldest_view_age_s: float | None
     units_live: int
     now_ns: Nanoseconds
@@ -536,10 +541,10 @@ class VoxelsAnswer(Answer):
 
 
 def matrix_of(transform: Transform) -> Matrix:
-    """A (4, 4) transform as nested tuples of numbers.
+    """Return a (4, 4) transform as nested tuples of numbers.
 
     Raises:
-        InputError: it is not (4, 4).
+        InputError: the shape is not (4, 4).
     """
     if transform.shape != (4, 4):
         raise InputError(f"transform: expected shape (4, 4), got {transform.shape}")

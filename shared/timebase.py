@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far the master's monotonic clock is from a unit's, from the messages that pass anyway (as NTP does).
+"""Offset between the master's and a unit's monotonic clock, estimated from the regular messages as in NTP.
 
-One exchange has four times: the unit sends, the master receives, the master answers, the unit gets
-the answer. The true offset lies within half the round trip around the middle, whatever the network
-did; so the best exchange is the one with the shortest trip, and what it tells grows old only as fast
-as two quartz clocks drift apart. Both sides use the same estimate: the master for the age of a view,
-the unit for the robot's joints at the time of a frame.
+One exchange has four times: the unit sends, the master receives, the master answers, the unit receives the answer.
+The true offset lies within half the round trip around the middle, for any network delays. So the exchange with the
+shortest round trip is the best one, and its bound grows only as fast as two quartz clocks drift apart. Both sides use
+the same estimate: the master for the age of a view, the unit for the robot's joints at the time of a frame.
 """
 
 from __future__ import annotations
@@ -13,16 +12,16 @@ from __future__ import annotations
 from typing import NamedTuple
 
 DRIFT_PPM_MAX = 100
-"""Two cheap quartz clocks, each off by up to 50 parts per million over temperature."""
+"""Drift between two cheap quartz clocks, each off by up to 50 parts per million over temperature."""
 
 RESOLUTION_NS = 1_000
-"""What a time stamp can be off by itself; keeps a trip of no duration from being believed for ever."""
+"""Error of a time stamp itself; without it, an exchange with a round trip of zero would stay the best for ever."""
 
 
 class Exchange(NamedTuple):
     """The four times of a request and its answer.
 
-    `sent_ns` and `returned_ns` are by the unit's clock, `received_ns` and `answered_ns` by the master's.
+    `sent_ns` and `returned_ns` are on the unit's clock, `received_ns` and `answered_ns` on the master's.
     """
 
     sent_ns: int
@@ -32,26 +31,26 @@ class Exchange(NamedTuple):
 
     @property
     def offset_ns(self) -> int:
-        """The master's clock less the unit's, in the middle of what is possible."""
+        """The master's clock less the unit's: the middle of the possible interval."""
         return (self.received_ns - self.sent_ns + self.answered_ns - self.returned_ns) // 2
 
     @property
     def uncertainty_ns(self) -> int:
-        """How far the true offset can be from `offset_ns`: half the time that the messages were under way."""
-        under_way_ns = (self.returned_ns - self.sent_ns) - (self.answered_ns - self.received_ns)
-        return max(under_way_ns // 2, 0) + RESOLUTION_NS
+        """Largest possible error of `offset_ns`: half the time that the messages travelled, and the resolution."""
+        travel_ns = (self.returned_ns - self.sent_ns) - (self.answered_ns - self.received_ns)
+        return max(travel_ns // 2, 0) + RESOLUTION_NS
 
     @property
     def possible(self) -> bool:
-        """Whether neither clock ran backwards in it."""
+        """True if neither clock ran backwards during the exchange."""
         return self.returned_ns >= self.sent_ns and self.answered_ns >= self.received_ns
 
 
 class ClockOffset:
-    """The running estimate of the master's clock less the unit's: the shortest trip wins, and fades as clocks drift.
+    """Running estimate of the master's clock less the unit's; it keeps the exchange with the smallest bound.
 
-    A clock that jumped proves itself: the estimate and a new exchange then cannot both be true, and the
-    new one is believed. Constant time and memory for each exchange.
+    The bound of an exchange grows with its age by the drift. After a jump of a clock, the estimate and a new exchange
+    contradict each other: the new one replaces the estimate. Time and memory for each exchange are constant.
     """
 
     def __init__(self) -> None:
@@ -59,7 +58,7 @@ class ClockOffset:
         self._best: Exchange | None = None
 
     def add(self, exchange: Exchange) -> None:
-        """Take one more exchange into account; an impossible one is passed over."""
+        """Add an exchange; ignore an impossible one."""
         if not exchange.possible:
             return
         best = self._best
@@ -75,23 +74,23 @@ class ClockOffset:
 
     @property
     def known(self) -> bool:
-        """Whether there was any exchange yet."""
+        """True after the first exchange."""
         return self._best is not None
 
     @property
     def offset_ns(self) -> int:
-        """The master's clock less the unit's.
+        """The master's clock less the unit's, in nanoseconds.
 
         Raises:
-            LookupError: no exchange was added yet.
+            LookupError: there was no exchange yet.
         """
         return self._known().offset_ns
 
     def uncertainty_ns(self, unit_now_ns: int) -> int:
-        """How far `offset_ns` can be off at `unit_now_ns` of the unit's clock.
+        """Return the largest possible error of `offset_ns` at `unit_now_ns` of the unit's clock.
 
         Raises:
-            LookupError: no exchange was added yet.
+            LookupError: there was no exchange yet.
         """
         return _bound_ns(self._known(), unit_now_ns)
 

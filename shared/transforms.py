@@ -17,25 +17,25 @@ from shared.errors import InputError
 Transform: TypeAlias = NDArray[np.float64]
 
 ROTATION_TOLERANCE = 1e-4
-"""How far `R @ R.T` may be from the identity: poses are read from text files with few digits."""
+"""Largest deviation of `R @ R.T` from the identity; text files give poses with few digits."""
 
 LAST_ROW_TOLERANCE = 1e-6
-"""How far the last row may be from 0 0 0 1: a product or an inverse of transforms in float32 leaves it off by 1e-7."""
+"""Largest deviation of the last row from 0 0 0 1; products and inverses in float32 are off by about 1e-7."""
 
 _LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 
 
 def identity() -> Transform:
-    """The transform that changes nothing."""
+    """Return the identity transform."""
     return np.eye(4)
 
 
 def validated(value: ArrayLike, name: str) -> Transform:
-    """Return `value` as a (4, 4) float64 rigid transform, a copy whose last row is exactly 0 0 0 1.
+    """Return `value` as a (4, 4) float64 rigid transform: a copy whose last row is exactly 0 0 0 1.
 
     Raises:
-        InputError: it is not (4, 4), not finite, or its rotation is not orthonormal and right-handed, or its last row
-            is off by more than rounding.
+        InputError: `value` is not (4, 4) or not finite, its rotation is not orthonormal and right-handed, or its last
+            row is off by more than rounding.
     """
     try:
         matrix = np.array(value, dtype=np.float64)
@@ -67,7 +67,7 @@ def from_rotation_translation(rotation: ArrayLike, translation_m: ArrayLike) -> 
 
 
 def rotation_about(axis: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
-    """The (3, 3) rotation by `angle_rad` about `axis` (3,), which need not have unit length (Rodrigues)."""
+    """Return the (3, 3) rotation by `angle_rad` about `axis` (3,) of any length (Rodrigues)."""
     direction = np.asarray(axis, dtype=np.float64)
     norm = float(np.linalg.norm(direction))
     if norm == 0.0:
@@ -79,7 +79,7 @@ def rotation_about(axis: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
 
 
 def from_xyz_rpy(xyz_m: ArrayLike, rpy_rad: ArrayLike) -> Transform:
-    """The URDF convention: rotate by roll about x, pitch about y, yaw about z (fixed axes), then shift."""
+    """Return the transform of a URDF origin: roll about x, pitch about y, yaw about z (fixed axes), then shift."""
     roll, pitch, yaw = np.asarray(rpy_rad, dtype=np.float64)
     rotation = (
         rotation_about((0.0, 0.0, 1.0), yaw)
@@ -90,20 +90,21 @@ def from_xyz_rpy(xyz_m: ArrayLike, rpy_rad: ArrayLike) -> Transform:
 
 
 def inverse(transform: Transform) -> Transform:
-    """`T_b_a` of a rigid `T_a_b`."""
+    """Return `T_b_a` of a rigid `T_a_b`."""
     rotation = transform[:3, :3].T
     return from_rotation_translation(rotation, -rotation @ transform[:3, 3])
 
 
 def apply(transform: Transform, points_m: NDArray[Any]) -> NDArray[np.float64]:
-    """Map points (..., 3) of frame b by `T_a_b` into frame a."""
+    """Map points (..., 3) in metres from frame b into frame a by `T_a_b`."""
     return np.asarray(points_m @ transform[:3, :3].T + transform[:3, 3], dtype=np.float64)
 
 
 def look_at(eye_m: ArrayLike, target_m: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Transform:
-    """`T_world_camera` of an optical frame at `eye_m` whose z axis points at `target_m`.
+    """Return `T_world_camera` of an optical frame at `eye_m` whose z axis points at `target_m`.
 
-    `up` is the world direction that is up in the picture; looking along it, world y takes its place, and z that of y.
+    `up` is the world direction that points up in the image. For a view along `up`, world y replaces it; for a view
+    along y as well, world z does.
 
     Raises:
         InputError: eye and target are the same point.
@@ -124,7 +125,7 @@ def look_at(eye_m: ArrayLike, target_m: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.
 
 
 def angle_rad(transform: Transform) -> float:
-    """The angle of the rotation, 0 to pi."""
+    """Return the angle of the rotation in rad, 0 to pi."""
     rotation = transform[:3, :3]
     skew = np.array(
         [

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A URDF file as plain joints and meshes, each mesh in its link's frame.
 
-yourdfpy reads the file (needed where a cell is loaded from its files, not on a unit that is sent one);
-meshes are found and read by ourselves, so that a missing one is an error instead of a warning.
+yourdfpy reads the file. It is needed only to load a cell from files, not on a unit that receives its cell. Our own code
+finds and reads meshes, so that a missing mesh is an error instead of a warning.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Mimic:
 
 @dataclass(frozen=True, eq=False)
 class UrdfJoint:
-    """A joint as the file has it; `T_parent_joint` is its `<origin>`, `axis` has unit length."""
+    """A joint of the file; `T_parent_joint` is its `<origin>`, and `axis` has unit length."""
 
     name: str
     kind: Literal["revolute", "continuous", "prismatic", "fixed"]
@@ -52,7 +52,7 @@ class UrdfJoint:
 
 @dataclass(frozen=True, eq=False)
 class UrdfModel:
-    """A tree of links. `joints` come parents first; `meshes` has the links with a shape, in the file's order."""
+    """A tree of links. `joints` has parents first; `meshes` has the links with a shape, in the file's order."""
 
     name: str
     root: str
@@ -70,15 +70,15 @@ def read_urdf(
     """Read a URDF file and the meshes that it names.
 
     Args:
-        path: the file; xacro must have been expanded before.
-        kind: which of its shapes to take.
-        packages: folders of ROS packages for `package://name/...`. Others are sought among the folders
-            above the file, and then among the installed Python packages.
-        replaced: meshes (link frame) to take for these links instead of the file's.
+        path: the file; expand xacro beforehand.
+        kind: the shapes of the file to use.
+        packages: folders of ROS packages for `package://name/...`. Other packages are searched for in the folders
+            above the file, then among the installed Python packages.
+        replaced: meshes (link frame) that replace the file's for these links.
 
     Raises:
-        KinematicsError: the file is missing, no URDF, no tree, or uses a joint that is not supported.
-        MeshError: a mesh that it names is missing or unusable.
+        KinematicsError: the file is missing, is not a URDF or not a tree, or uses an unsupported joint.
+        MeshError: a mesh of the file is missing or unusable.
     """
     file = Path(path)
     robot = _parse(file)
@@ -103,13 +103,13 @@ def read_urdf(
 
 
 def _parse(file: Path) -> Any:
-    """yourdfpy's robot, from XML that was checked to be complete."""
+    """Parse the file into yourdfpy's robot, after checking that the XML is complete."""
     try:
         import yourdfpy
     except ImportError as error:
-        raise KinematicsError(f"{file}: expected yourdfpy to read a URDF, but it is not installed") from error
+        raise KinematicsError(f"{file}: expected yourdfpy to read a URDF, got no such package installed") from error
     try:
-        # Without namespaces: files in use carry prefixes that they never declare.
+        # Without namespaces: existing files use prefixes that they never declare.
         document = expatbuilder.parse(str(file), namespaces=False)
     except OSError as error:
         raise KinematicsError(f"{file}: expected a readable URDF file, got {error.strerror}") from error
@@ -127,7 +127,7 @@ def _parse(file: Path) -> Any:
             build_scene_graph=False,
             load_meshes=False,
         )
-    # It checks little, so damage shows as whatever error reading on happens to meet.
+    # yourdfpy checks little, so a damaged file can raise any error.
     except Exception as error:
         raise KinematicsError(f"{file}: expected a URDF file, got {type(error).__name__}: {error}") from error
     if not model.robot.links:
@@ -136,7 +136,7 @@ def _parse(file: Path) -> Any:
 
 
 def _drop_prefixed(element: minidom.Element) -> None:
-    """Remove elements and attributes of other tools (`drake:...`), which are no part of a URDF."""
+    """Remove elements and attributes of other tools (`drake:...`), which are not part of a URDF."""
     for name in list(element.attributes.keys()):
         if ":" in name:
             element.removeAttribute(name)
@@ -184,7 +184,7 @@ def _origin(where: str, origin: Any) -> Transform:
 
 
 def _tree(file: Path, links: tuple[str, ...], joints: tuple[UrdfJoint, ...]) -> tuple[str, tuple[UrdfJoint, ...]]:
-    """The root link, and the joints in the order of the chain: depth first, siblings in the file's order."""
+    """Return the root link, and the joints in chain order: depth first, siblings in the file's order."""
     for what, names in (("link", links), ("joint", [joint.name for joint in joints])):
         twice = sorted({name for name in names if list(names).count(name) > 1})
         if twice:
@@ -195,7 +195,7 @@ def _tree(file: Path, links: tuple[str, ...], joints: tuple[UrdfJoint, ...]) -> 
             raise KinematicsError(f"{file}: expected one joint to hold link {joint.child}, got several")
     roots = [link for link in links if link not in children]
     if len(roots) != 1:
-        raise KinematicsError(f"{file}: expected one link that no joint holds, got {', '.join(roots) or 'none'}")
+        raise KinematicsError(f"{file}: expected one link that is no joint's child, got {', '.join(roots) or 'none'}")
     ordered: list[UrdfJoint] = []
     pending = [joint for joint in reversed(joints) if joint.parent == roots[0]]
     while pending:
@@ -204,12 +204,12 @@ def _tree(file: Path, links: tuple[str, ...], joints: tuple[UrdfJoint, ...]) -> 
         pending.extend(other for other in reversed(joints) if other.parent == joint.child)
     if len(ordered) != len(joints):
         lost = sorted({joint.name for joint in joints} - {joint.name for joint in ordered})
-        raise KinematicsError(f"{file}: expected all joints to hang on {roots[0]}, got a ring of {', '.join(lost)}")
+        raise KinematicsError(f"{file}: expected all joints below {roots[0]}, got a ring of {', '.join(lost)}")
     return roots[0], tuple(ordered)
 
 
 def _shape(file: Path, link: str, element: Any, packages: Mapping[str, Path]) -> TriangleMesh:
-    """One `<collision>` or `<visual>` in the link's frame."""
+    """Return the mesh of one `<collision>` or `<visual>` in the link's frame."""
     where = f"{file}: link {link}"
     geometry = element.geometry
     try:
@@ -231,7 +231,7 @@ def _shape(file: Path, link: str, element: Any, packages: Mapping[str, Path]) ->
 
 
 def _mesh_file(file: Path, link: str, uri: str | None, packages: Mapping[str, Path]) -> Path:
-    """The file that `<mesh filename>` means: relative to the URDF, absolute, `file://` or `package://`."""
+    """Resolve `<mesh filename>` to a file: relative to the URDF, absolute, `file://` or `package://`."""
     if not uri:
         raise KinematicsError(f"{file}: link {link}: expected a mesh with a filename, got none")
     if uri.startswith("file://"):

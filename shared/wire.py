@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages as bytes, and back; whatever is wrong with bytes from the network is one `WireError`.
+"""Encode messages as bytes and decode them; each error of bytes from the network is a `WireError`.
 
-The body of `/update` is a msgpack map of the fields of `UpdateRequest` that are not at their default,
+The body of `/update` is a msgpack map of the fields of `UpdateRequest` that are not at their default:
 
     id, session, sequence, sent_at_ns   integers, 1 to 9 bytes each
     captured_at_ns, joints_until_ns     integers of 9 bytes
@@ -9,13 +9,13 @@ The body of `/update` is a msgpack map of the fields of `UpdateRequest` that are
     versions                            array of 4 small integers, 5 to 13 bytes
     keys                                binary, 4 bytes a voxel: ascending little-endian uint32
     seen                                map, only when it changed: at most 4 kB (see `pack_seen`)
-    health                              array of 10 values and those of newer minors, some 50 bytes
+    health                              array of 10 values and those of newer minors, about 50 bytes
     phase                               text, only while the unit is not live
 
-and its answer those of `UpdateAnswer`, where each joint sample is `[at_ns, positions, velocities]`
-with little-endian float32 as binary. `versions` and `health` are the values of their fields in order: at 30 updates a
-second the names would be a fifth of all that is not voxels. Both with all their HTTP headers, and joints at 125 Hz
-in the answer, stay within 4 bytes a voxel + 800.
+The answer is a map of the fields of `UpdateAnswer`. Each joint sample is `[at_ns, positions, velocities]` with
+little-endian float32 as binary. `versions` and `health` are the values of their fields in order: at 30 updates a
+second the names would be a fifth of everything except the voxels. Both bodies, with all HTTP headers and with joints
+at 125 Hz in the answer, stay within 4 bytes a voxel + 800.
 """
 
 from __future__ import annotations
@@ -49,24 +49,24 @@ from shared.messages import (
 MEDIA_TYPE = "application/msgpack"
 
 MAX_FIXED_BYTES = 2**14
-"""Of an update without keys and seen report: its numbers and names, and a sentence for each of MAX_COMMANDS."""
+"""Limit of an update without keys and seen report: numbers, names, and a sentence for each of MAX_COMMANDS."""
 
 MAX_UPDATE_BYTES = 4 * MAX_VOXELS + MAX_SEEN_BYTES + MAX_FIXED_BYTES
 
 MAX_ANSWER_BYTES = 2**20
-"""Of what a master answers to a unit, meshes apart; a cell's document is the largest."""
+"""Limit of a master's answer to a unit, except meshes; a cell's document is the largest."""
 
 SHOWN_CHARS = 60
-"""Enough of a wrong value to recognise it."""
+"""Maximum length of a quoted value: enough to recognise it."""
 
 MAX_SEEN_BLOCKS = 2**22
-"""A hall of 64 m by 64 m by 10 m in blocks of 100 mm; half a MiB of bits."""
+"""Limit of blocks: a hall of 64 m by 64 m by 10 m in blocks of 100 mm; half a MiB of bits."""
 
 ROWS: dict[str, type[BaseModel]] = {"versions": Versions, "health": Health}
-"""Fields of an update and its answer that travel as the bare values of their own fields, in order."""
+"""Fields of an update and its answer that travel as rows: the values of their own fields, in order, without names."""
 
 LEAST = {"versions": 4, "health": 10}
-"""Values of such a row that every unit sends: as many as contract 5.0 had."""
+"""Least number of values in a row: as many as contract 5.0 had."""
 
 _VALUES = {name: attrgetter(*model.model_fields) for name, model in ROWS.items()}
 
@@ -74,41 +74,41 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def unpack(data: bytes, max_bytes: int) -> Any:
-    """Plain msgpack, arrays as lists, names as text.
+    """Unpack msgpack into plain values, with arrays as lists and names as text.
 
     Raises:
-        WireError: longer than `max_bytes`, or malformed.
+        WireError: the data are longer than `max_bytes`, or malformed.
     """
     if len(data) > max_bytes:
         raise WireError(f"message: expected at most {max_bytes} bytes, got {len(data)}")
     try:
-        # Not `msgpack`, which interns all names: up to Python 3.12.5 what is interned is never freed.
+        # Not `msgpack`, which interns all names: up to Python 3.12.5, interned strings are never freed.
         return ormsgpack.unpackb(data)
     except ormsgpack.MsgpackDecodeError as error:
-        raise WireError(f"message: no msgpack: {error}") from error
+        raise WireError(f"message: expected msgpack, got other bytes: {error}") from error
 
 
 def encode(message: BaseModel) -> bytes:
-    """Any message as msgpack, without the fields that are None."""
+    """Encode any message as msgpack, without the fields that are None."""
     packed: bytes = msgpack.packb(message.model_dump(exclude_none=True))
     return packed
 
 
 def decode(model: type[Model], data: bytes, max_bytes: int = MAX_ANSWER_BYTES) -> Model:
-    """A message of the given model.
+    """Decode a message of the given model.
 
     Raises:
-        WireError: too long, no msgpack, or a field is missing, unknown, of another type or out of range.
+        WireError: the data are too long or not msgpack, or a field is missing, unknown or invalid.
     """
     fields = unpack(data, max_bytes)
     try:
         return _validated(model, _with_tuples(fields))
     except RecursionError as error:
-        raise WireError("message: expected values in a few levels, got them nested too deeply") from error
+        raise WireError("message: expected a few levels of nesting, got too many") from error
 
 
 def encode_update(update: UpdateRequest) -> bytes:
-    """The body of `POST /update`."""
+    """Encode the body of `POST /update`."""
     fields = update.model_dump(exclude_defaults=True)
     for name in fields.keys() & ROWS:
         fields[name] = _VALUES[name](getattr(update, name))
@@ -121,7 +121,7 @@ def encode_update(update: UpdateRequest) -> bytes:
 
 
 def decode_update(data: bytes) -> UpdateRequest:
-    """An update from the body of `POST /update`; its keys are still bytes.
+    """Decode the body of `POST /update`; the keys stay bytes.
 
     Raises:
         WireError: as in `decode`.
@@ -130,7 +130,7 @@ def decode_update(data: bytes) -> UpdateRequest:
 
 
 def encode_update_answer(answer: UpdateAnswer, answered_at_ns: int | None = None) -> bytes:
-    """The body of the answer to `POST /update`, given at `answered_at_ns` if that is not known before now."""
+    """Encode the answer to `POST /update`; `answered_at_ns` replaces the time in `answer`, if given."""
     fields = answer.model_dump(exclude_defaults=True, exclude={"versions", "joints"})
     if answered_at_ns is not None:
         fields["answered_at_ns"] = answered_at_ns
@@ -145,7 +145,7 @@ def encode_update_answer(answer: UpdateAnswer, answered_at_ns: int | None = None
 
 
 def decode_update_answer(data: bytes) -> UpdateAnswer:
-    """The answer to an update.
+    """Decode the answer to `POST /update`.
 
     Raises:
         WireError: as in `decode`.
@@ -157,10 +157,10 @@ def decode_update_answer(data: bytes) -> UpdateAnswer:
 
 
 def keys_to_bytes(keys: NDArray[np.uint32]) -> bytes:
-    """Lattice keys (N,), ascending, as they travel.
+    """Encode lattice keys (N,), ascending.
 
     Raises:
-        InputError: more than `MAX_VOXELS`.
+        InputError: there are more than `MAX_VOXELS` keys.
     """
     if keys.size > MAX_VOXELS:
         raise InputError(f"keys: expected at most {MAX_VOXELS} voxels in one update, got {keys.size}")
@@ -168,10 +168,10 @@ def keys_to_bytes(keys: NDArray[np.uint32]) -> bytes:
 
 
 def keys_from_bytes(data: bytes, cell_count: int) -> NDArray[np.uint32]:
-    """Lattice keys (N,) uint32 of a lattice of `cell_count` voxels; read-only, no copy.
+    """Decode lattice keys (N,) uint32 of a lattice of `cell_count` voxels; read-only, without a copy.
 
     Raises:
-        WireError: no whole number of keys, not ascending, or beyond the lattice.
+        WireError: the keys are not a whole number, not ascending, or beyond the lattice.
     """
     if len(data) % 4:
         raise WireError(f"keys: expected 4 bytes a voxel, got {len(data)} bytes")
@@ -185,7 +185,7 @@ def keys_from_bytes(data: bytes, cell_count: int) -> NDArray[np.uint32]:
 
 
 def pack_seen(seen: NDArray[Any], block_size_m: float) -> SeenReport | None:
-    """A seen grid (nx, ny, nz), bool or 0 and 1, as a report; None when it would exceed `MAX_SEEN_BYTES`."""
+    """Encode a seen grid (nx, ny, nz), bool or 0 and 1; return None when it exceeds `MAX_SEEN_BYTES`."""
     bits = zlib.compress(np.packbits(seen, bitorder="little").tobytes())
     if len(bits) > MAX_SEEN_BYTES:
         return None
@@ -194,10 +194,10 @@ def pack_seen(seen: NDArray[Any], block_size_m: float) -> SeenReport | None:
 
 
 def unpack_seen(report: SeenReport) -> NDArray[np.bool_]:
-    """The seen grid (nx, ny, nz) bool of a report.
+    """Decode the seen grid (nx, ny, nz) bool of a report.
 
     Raises:
-        WireError: too many blocks, damaged, or not as many bits as its shape has blocks.
+        WireError: there are too many blocks, or the bits are damaged or do not match the shape.
     """
     blocks = math.prod(report.shape)
     if blocks > MAX_SEEN_BLOCKS:
@@ -222,7 +222,7 @@ def _validated(model: type[Model], fields: Any) -> Model:
 
 
 def _with_tuples(value: Any) -> Any:
-    """The same with tuples in place of lists, as models have them."""
+    """Replace all lists by tuples, as models expect."""
     if isinstance(value, list):
         return tuple([_with_tuples(one) for one in value])
     if isinstance(value, dict):
@@ -231,7 +231,7 @@ def _with_tuples(value: Any) -> Any:
 
 
 def _with_rows(fields: Any) -> Any:
-    """The same for what takes no more levels than an update does, in less time; deeper lists stay and are refused."""
+    """Replace lists of the two levels of an update by tuples, faster; deeper lists stay and are refused."""
     if isinstance(fields, dict):
         for name, value in fields.items():
             if isinstance(value, list):
@@ -242,7 +242,7 @@ def _with_rows(fields: Any) -> Any:
 
 
 def _named(fields: Any, of_newer: bool) -> Any:
-    """What came, with the names of what travels without; a row `of_newer` sides may be longer than we know."""
+    """Turn rows into fields with names; rows of a newer side (`of_newer`) may be longer than known."""
     if isinstance(fields, dict):
         for name, model in ROWS.items():
             if name in fields:
@@ -251,7 +251,7 @@ def _named(fields: Any, of_newer: bool) -> Any:
                 if not isinstance(row, tuple) or len(row) < least or (len(row) > most and not of_newer):
                     count = f"{least}" if least == most else f"{least} to {most}"
                     raise WireError(f"{name}: expected an array of {count} values, got {repr(row)[:SHOWN_CHARS]}")
-                # Shorter is an older unit's, longer a newer master's.
+                # A row of an older unit is shorter, one of a newer master longer.
                 fields[name] = named = dict(zip(names, row, strict=False))
                 if isinstance(progress := named.get("progress"), tuple):
                     if len(progress) > len(Progress.model_fields):

@@ -21,7 +21,7 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 SLOW_TIMEOUT_S = 600
 # What was told to stop may need a moment; what nobody told to stop outlives any moment.
 GRACE_S = 3.0
-# Real processes, whose times others' load would disturb.
+# Real processes, whose times others' load would disturb, but for tests that are marked `patient`.
 ALONE = CHECKOUT / "tests" / "system"
 # A blocking call stalls every other unit's updates, so async code of the daemons may make none.
 EVENT_LOOP_TESTS = tuple(CHECKOUT / "tests" / package for package in ("edge_unit", "master_server"))
@@ -36,7 +36,7 @@ settings.load_profile("patient")
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
-        if ALONE in item.path.parents:
+        if ALONE in item.path.parents and not item.get_closest_marker("patient"):
             item.add_marker(pytest.mark.alone)
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT_S))

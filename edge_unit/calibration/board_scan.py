@@ -10,8 +10,9 @@ from contextlib import aclosing
 from edge_unit.calibration.board_pose import BoardLocaliser, Localisation
 from edge_unit.sources.image import ImageSource, ImageStream
 from shared.cell import Board
-from shared.clock import NS_PER_S, monotonic_ns
+from shared.clock import NS_PER_S
 from shared.errors import BoardError, SourceError
+from shared.waiting import LOOP_CLOCK, Clock
 
 FRAMES = 20
 """Images of which most show the board: more would not help the mean, as their common error does not average out."""
@@ -34,8 +35,9 @@ RETRY_MAX_S = 30.0
 class BoardSearch:
     """One unit's search for its cell's board."""
 
-    def __init__(self, source: object, stream: ImageStream) -> None:
+    def __init__(self, source: object, stream: ImageStream, clock: Clock = LOOP_CLOCK) -> None:
         """Without an `ImageSource` as `source` there are no images to search."""
+        self._clock = clock
         self._source = source
         self._stream: ImageStream = stream
         self._retry_s = RETRY_MIN_S
@@ -47,9 +49,10 @@ class BoardSearch:
         """True if the source has images at all."""
         return isinstance(self._source, ImageSource)
 
-    def due(self, now_ns: int) -> bool:
-        """Return True if it is time for another search."""
-        return self.possible and now_ns >= self._next_ns
+    @property
+    def due(self) -> bool:
+        """True if it is time for another search."""
+        return self.possible and self._clock.now_ns() >= self._next_ns
 
     def begin_anew(self) -> None:
         """Search at once, and with short pauses again."""
@@ -66,7 +69,7 @@ class BoardSearch:
         source = self._source
         if not isinstance(source, ImageSource):
             raise BoardError("this unit's source has no images in which to look for the board")
-        begun_ns = monotonic_ns()
+        begun_ns = self._clock.now_ns()
         try:
             async with source.open_images(self._stream) as feed:
                 info = feed.info
@@ -80,7 +83,7 @@ class BoardSearch:
                         tell(f"looking for the board: {localiser.now}")
                         seen += 1
                         empty = 0 if sighting.detection.markers else empty + 1
-                        late = monotonic_ns() - begun_ns > MAX_LOOK_S * NS_PER_S
+                        late = self._clock.now_ns() - begun_ns > MAX_LOOK_S * NS_PER_S
                         if late or empty >= EMPTY_FRAMES or localiser.frames_with_pose >= FRAMES:
                             break
                         if await asyncio.to_thread(_is_good, localiser):
@@ -90,7 +93,7 @@ class BoardSearch:
                 found = await asyncio.to_thread(localiser.result)
         except (BoardError, SourceError) as error:
             self.outcome = str(error)
-            self._next_ns = monotonic_ns() + round(self._retry_s * NS_PER_S)
+            self._next_ns = self._clock.now_ns() + round(self._retry_s * NS_PER_S)
             self._retry_s = min(2.0 * self._retry_s, RETRY_MAX_S)
             raise
         self.outcome = ""

@@ -38,10 +38,10 @@ from edge_unit.uplink.cell_cache import CellCache
 from edge_unit.uplink.client import MasterClient
 from edge_unit.uplink.master_discovery import MasterSearch
 from edge_unit.uplink.uplink import Uplink
-from shared.clock import monotonic_ns
 from shared.errors import InputError, SourceError
 from shared.messages import Command, Outcome
 from shared.transforms import Transform
+from shared.waiting import LOOP_CLOCK, Clock, done_within, sleep
 
 logger = logging.getLogger(__name__)
 
@@ -65,17 +65,27 @@ DRAIN_S = 2.0
 class Unit:
     """One camera, one master; `run` until cancelled or until a recording ends."""
 
-    def __init__(self, config: UnitConfig, source: DepthSource, client: MasterClient | None = None) -> None:
-        """Reads and opens files, so make it before the event loop runs.
+    def __init__(
+        self,
+        config: UnitConfig,
+        source: DepthSource,
+        client: MasterClient | None = None,
+        clock: Clock = LOOP_CLOCK,
+    ) -> None:
+        """Read and open files, so make it before the event loop runs.
+
+        `clock` is the clock of the source's `captured_at_ns`. Without `client` the unit makes one and searches for the
+        master.
 
         Raises:
             ConfigError: the trace cannot be written, or the configured pose cannot be read.
         """
         self._config = config
         self._source = source
-        self._masters: MasterSearch | None = None
+        self._clock = clock
+        masters = None
         if client is None:
-            self._masters = MasterSearch(config)
+            masters = MasterSearch(config, clock)
             client = MasterClient(config.master_url, config.read_token, config.source_address, tls=config.tls())
         self._client = client
         self.uplink = Uplink(
@@ -84,18 +94,19 @@ class Unit:
             f"edge-unit {importlib.metadata.version('cellwatch')}",
             boot_id(),
             self._note,
-            self._masters,
+            masters,
+            clock,
         )
         self._camera = CameraStatus(config, self.uplink)
         self._trace = None if config.trace_path is None else Trace(config.trace_path)
-        self._search = BoardSearch(source, config.board_stream)
+        self._search = BoardSearch(source, config.board_stream, clock)
         self._work = self._frame_work()
         self._errands = TaskGroup()
         self._showing = ImageRequests(self.uplink, self._work.assigned, self._errands)
-        self._progress = StallDetector()
+        self._progress = StallDetector(clock)
         self._rehearsal: asyncio.Task[None] | None = None
         self._limiter = FrameLimiter(config.fps_max)
-        self._status = UnitStatus(monotonic_ns())
+        self._status = UnitStatus(clock)
 
     def _frame_work(self) -> FrameProcessor:
         config, finish = self._config, self.uplink.finish
@@ -114,8 +125,8 @@ class Unit:
         """
         async with self._client:
             tasks = [asyncio.create_task(self.uplink.run()), asyncio.create_task(self._watch())]
-            if self._masters is not None:
-                tasks.append(asyncio.create_task(self._masters.run()))
+            if self.uplink.search is not None:
+                tasks.append(asyncio.create_task(self.uplink.search.run()))
             if isinstance(self._source, ReportsStatus):
                 tasks.append(asyncio.create_task(self._camera.follow(self._source)))
             try:
@@ -136,12 +147,12 @@ class Unit:
     def status(self) -> str:
         """One line for a person: camera, frames a second since it was asked last, master."""
         trouble = self.uplink.camera_state.trouble
-        line = self._status.line(None if trouble is None else trouble.sentence, monotonic_ns())
+        line = self._status.line(None if trouble is None else trouble.sentence)
         return f"{line}; {self.uplink.standing}"
 
     def stuck(self) -> str | None:
         """What hangs and will not come to its end by itself; waiting for a camera or a master is not of that kind."""
-        return self._progress.stuck(monotonic_ns())
+        return self._progress.stuck()
 
     def _note(self, report: Report, delivery: Delivery | None) -> None:
         if self._trace is not None:
@@ -167,7 +178,7 @@ class Unit:
                 await self._camera.failed(error)
             finally:
                 await self._source.close()
-            await asyncio.sleep(retry_s)
+            await sleep(retry_s, self._clock)
             retry_s = min(2.0 * retry_s, REOPEN_MAX_S)
 
     async def _open(self) -> None:
@@ -175,7 +186,7 @@ class Unit:
             self._rehearsal = asyncio.create_task(asyncio.to_thread(self._rehearse))
         camera = await self._source.open()
         # Who registers is live with the next frame; but a unit that has to compile first tells that it is there.
-        await asyncio.wait((self._rehearsal,), timeout=REHEARSAL_S)
+        await done_within(REHEARSAL_S, self._rehearsal, self._clock)
         self._work.assigned.open(camera)
         await self._camera.opened(camera)
         await asyncio.gather(self.uplink.assigned.wait(), self._rehearsal)
@@ -229,14 +240,14 @@ class Unit:
         self.uplink.offer(report)
         await self._showing.show(orders.pictures, frame, None)
         wanted = self._config.localise and assignment.cell.board is not None
-        if wanted and self._search.due(monotonic_ns()):
+        if wanted and self._search.due:
             await localise(self._search, self.uplink, assignment, frame)
 
     async def _filter(
         self, assignment: Assignment, T_world_camera: Transform, frame: DepthFrame, orders: CommandBatch
     ) -> None:
         """Process the frame and offer the result; nothing that follows delays it."""
-        stages = StageTimer(frame.captured_at_ns)
+        stages = StageTimer(frame.captured_at_ns, self._clock)
         stages.end("source")
         joints = await self._work.joints.at(assignment, frame)
         stages.end("joints")

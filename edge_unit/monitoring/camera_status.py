@@ -13,7 +13,7 @@ from edge_unit.sources.status import ReportsStatus
 from edge_unit.uplink.assignment import Trouble
 from edge_unit.uplink.uplink import Uplink
 from shared.errors import SourceError
-from shared.messages import MAX_TEXT, ToldOrigin
+from shared.messages import MAX_TEXT, ReportedOrigin
 from shared.transforms import Transform
 
 logger = logging.getLogger(__name__)
@@ -29,7 +29,7 @@ class CameraStatus:
         self._wanted: str | None = getattr(config.source, "serial", None)
         self._camera: CameraInfo | None = None
         configured = config.T_world_camera
-        self.known_pose: tuple[Transform, ToldOrigin] | None = (
+        self.known_pose: tuple[Transform, ReportedOrigin] | None = (
             None if configured is None else (configured.transform(), "configured")
         )
 

@@ -29,10 +29,10 @@ from edge_unit.uplink.master_selection import (
     in_order,
     objection,
 )
-from shared.clock import NS_PER_S, monotonic_ns
+from shared.clock import NS_PER_S
 from shared.discovery import MAX_OFFERS, Browser, Offer, own_addresses
 from shared.files import StateFile
-from shared.waiting import within
+from shared.waiting import LOOP_CLOCK, Clock, wait_set, within
 
 logger = logging.getLogger(__name__)
 
@@ -63,12 +63,13 @@ FILE_NAME = "master.json"
 class MasterSearch:
     """Where the master is. Whoever talks to it says whether it answers; `run` looks for another when it does not."""
 
-    def __init__(self, config: UnitConfig) -> None:
-        """Reads files, so make it before the event loop runs.
+    def __init__(self, config: UnitConfig, clock: Clock = LOOP_CLOCK) -> None:
+        """Read files, so make it before the event loop runs.
 
         Raises:
             ConfigError: `master_ca` cannot be read or holds no certificate.
         """
+        self._clock = clock
         self._wanted = wanted_of(config)
         self._source_address = config.source_address
         self._path = config.state_dir / FILE_NAME
@@ -81,8 +82,8 @@ class MasterSearch:
         self._answered_once = False
         self._vain: dict[str, int] = {}
         self._cells: set[str] = set()
-        self._told = ""
-        self._told_at_ns = monotonic_ns() - round(TELL_S * NS_PER_S)
+        # The last line in the journal, and its time.
+        self._logged = "", clock.now_ns() - round(TELL_S * NS_PER_S)
         self.outcome = "no master is configured, and none was known before"
         """What was found last, in words."""
         if self._place is None:
@@ -127,22 +128,22 @@ class MasterSearch:
         """Look whenever it is lost, until cancelled."""
         while True:
             await self._lost.wait()
-            began_ns = none_since_ns = monotonic_ns()
+            began_ns = none_since_ns = self._clock.now_ns()
             async with Browser() as browser:
                 while self.lost:
                     browser.changed.clear()
-                    offers, now_ns = await browser.offers(), monotonic_ns()
+                    offers, now_ns = await browser.offers(), self._clock.now_ns()
                     if not offers:
                         none_since_ns = now_ns
                     hear_s = HEAR_FIRST_S if self._any_cell else HEAR_S
                     heard = now_ns - (none_since_ns if offers else began_ns) >= hear_s * NS_PER_S
                     await self._look(offers if heard else None)
                     if self.lost:
-                        await within(LOOK_S if heard else HEAR_S, browser.changed.wait())
+                        await wait_set(browser.changed, LOOK_S if heard else HEAR_S, self._clock)
 
     async def _look(self, offers: Sequence[Offer] | None) -> None:
         """Take another place, if there is one that will do; None: it is too early to choose among offers."""
-        now_ns = monotonic_ns()
+        now_ns = self._clock.now_ns()
         self._vain = {url: at_ns for url, at_ns in self._vain.items() if now_ns - at_ns < VAIN_S * NS_PER_S}
         before = [first_place(self._wanted, None), first_place(Wanted(), self._kept)]
         for place in before:
@@ -160,9 +161,11 @@ class MasterSearch:
         chosen, self.outcome = choose(candidates, self._cells)
         if chosen is not None and chosen.url is not None:
             self._take(Place(chosen.url, self.outcome))
-        elif now_ns - self._told_at_ns >= TELL_S * NS_PER_S and self.outcome != self._told:
+            return
+        logged, logged_at_ns = self._logged
+        if now_ns - logged_at_ns >= TELL_S * NS_PER_S and self.outcome != logged:
             logger.info("%s", self.outcome)
-            self._told, self._told_at_ns = self.outcome, now_ns
+            self._logged = self.outcome, now_ns
 
     @property
     def _any_cell(self) -> bool:
@@ -178,7 +181,7 @@ class MasterSearch:
 
     def _take(self, place: Place) -> None:
         if self._place is not None and not self._answered_once:
-            self._vain[self._place.url] = monotonic_ns()
+            self._vain[self._place.url] = self._clock.now_ns()
         self._place = place
         self._silent_since_ns = None
         self._answered_once = False

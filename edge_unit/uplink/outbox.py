@@ -8,7 +8,7 @@ import logging
 from collections.abc import Callable
 
 from edge_unit.uplink.assignment import Delivery, Report
-from shared.waiting import within
+from shared.waiting import LOOP_CLOCK, Clock, wait_set, within
 
 logger = logging.getLogger(__name__)
 
@@ -17,10 +17,17 @@ HEARTBEAT_S = 0.2
 
 
 class Outbox:
-    """Latest-only. `on_sent` is told of each report how it reached the master; None: it never did."""
+    """Latest-only.
 
-    def __init__(self, on_sent: Callable[[Report, Delivery | None], None]) -> None:
+    Attributes:
+        last: the report that was sent last, to be sent again while no new one comes.
+    """
+
+    def __init__(self, on_sent: Callable[[Report, Delivery | None], None], clock: Clock = LOOP_CLOCK) -> None:
+        """Call `on_sent` for each report with its delivery, or with None if it never reached the master."""
         self._on_sent = on_sent
+        self._clock = clock
+        self.last: Report | None = None
         self._fresh: Report | None = None
         self._wake = asyncio.Event()
         self._idle = asyncio.Event()
@@ -74,15 +81,12 @@ class Outbox:
     async def woken(self, *, heartbeat: bool = True) -> None:
         """Wait until something is to be sent, with `heartbeat` no longer than until the next one."""
         self._wake.clear()
-        # No wait_for here: until Python 3.12 it swallows a cancellation that comes together with the event.
-        timer = asyncio.get_running_loop().call_later(HEARTBEAT_S, self._wake.set) if heartbeat else None
-        try:
+        if heartbeat:
+            await wait_set(self._wake, HEARTBEAT_S, self._clock)
+        else:
             await self._wake.wait()
-        finally:
-            if timer is not None:
-                timer.cancel()
 
     async def drained(self, timeout_s: float) -> None:
         """Wait until nothing is left to be sent, but no longer than `timeout_s`."""
-        if not await within(timeout_s, self._idle.wait()):
+        if not await within(timeout_s, self._idle.wait(), self._clock):
             logger.warning("the last frame did not reach the master")

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from shared.clock import monotonic_ns
 from shared.messages import InitializeAnswer, SlotAnswer, UpdateAnswer, Versions
 from shared.timebase import ClockOffset, Exchange
 
@@ -31,10 +30,10 @@ class Session:
     acknowledged: tuple[Versions, bytes] | None = None
 
     @classmethod
-    def begun(cls, slot: InitializeAnswer | SlotAnswer, sent_at_ns: int) -> Session:
-        """Begin with the answer to a registration that was sent at `sent_at_ns`."""
+    def begun(cls, slot: InitializeAnswer | SlotAnswer, sent_at_ns: int, returned_at_ns: int) -> Session:
+        """Begin with the answer to a registration that was sent at `sent_at_ns`; it came at `returned_at_ns`."""
         session = cls(id=slot.id, master_minor=slot.contract_minor)
-        session.note(sent_at_ns, slot)
+        session.note(sent_at_ns, slot, returned_at_ns)
         return session
 
     def next_sequence(self) -> int:
@@ -42,7 +41,7 @@ class Session:
         self.sequence += 1
         return self.sequence
 
-    def note(self, sent_at_ns: int, answer: InitializeAnswer | SlotAnswer | UpdateAnswer) -> None:
-        """Take in the times of a question that was sent at `sent_at_ns`, and of its answer, which came now."""
-        self.exchange = Exchange(sent_at_ns, answer.received_at_ns, answer.answered_at_ns, monotonic_ns())
+    def note(self, sent_at_ns: int, answer: InitializeAnswer | SlotAnswer | UpdateAnswer, returned_at_ns: int) -> None:
+        """Take in the times of a request that was sent at `sent_at_ns`; its answer came at `returned_at_ns`."""
+        self.exchange = Exchange(sent_at_ns, answer.received_at_ns, answer.answered_at_ns, returned_at_ns)
         self.clock.add(self.exchange)

@@ -35,7 +35,7 @@ from edge_unit.uplink.master_discovery import MasterSearch
 from edge_unit.uplink.outbox import Outbox
 from edge_unit.uplink.session import Session
 from shared.cell import Cell
-from shared.clock import NS_PER_S, monotonic_ns
+from shared.clock import NS_PER_S
 from shared.errors import (
     CellError,
     CellwatchError,
@@ -57,8 +57,8 @@ from shared.messages import (
     Outcome,
     Phase,
     PoseQuality,
+    ReportedOrigin,
     SlotAnswer,
-    ToldOrigin,
     UpdateAnswer,
     UpdateRequest,
     Versions,
@@ -66,6 +66,7 @@ from shared.messages import (
 )
 from shared.timebase import ClockOffset
 from shared.transforms import Transform, validated
+from shared.waiting import LOOP_CLOCK, Clock, sleep
 from shared.wire import decode
 
 logger = logging.getLogger(__name__)
@@ -123,7 +124,7 @@ class _Presented(NamedTuple):
     """The camera to register with, and the pose that the master is told: `T_world_camera` and where it is from."""
 
     camera: CameraInfo
-    known_pose: tuple[Transform, ToldOrigin] | None
+    known_pose: tuple[Transform, ReportedOrigin] | None
 
 
 class Uplink:
@@ -137,18 +138,20 @@ class Uplink:
         boot_id: str,
         on_sent: Callable[[Report, Delivery | None], None],
         search: MasterSearch | None = None,
+        clock: Clock = LOOP_CLOCK,
     ) -> None:
         """`on_sent` is told of each report how it reached the master; None: it never did.
 
-        `search` tells where the master is; without, it is where the client was aimed at, for ever.
+        `search` tells where the master is; without, it is where the client was aimed at, for ever. `clock` is the
+        unit's clock; the timeouts of requests are the client's own.
         """
         self._client = client
-        self._search = search
+        self._time = clock
+        self.search = search
         self._cells = cells
         self._program = software, boot_id
         self._presented: _Presented | None = None
-        self._outbox = Outbox(on_sent)
-        self._last: Report | None = None
+        self._outbox = Outbox(on_sent, clock)
         self._ledger = CommandLedger()
         self._session = Session()
         self._latest = LatestAssignment()
@@ -180,7 +183,7 @@ class Uplink:
 
     # ------------------------------------------------------------------ what the unit calls
 
-    def set_camera(self, camera: CameraInfo, known_pose: tuple[Transform, ToldOrigin] | None) -> None:
+    def set_camera(self, camera: CameraInfo, known_pose: tuple[Transform, ReportedOrigin] | None) -> None:
         """This is the camera to register with; another one than before means registering again.
 
         `known_pose` (`T_world_camera` and where it is from) is told to the master, which may know better.
@@ -220,8 +223,8 @@ class Uplink:
     @property
     def standing(self) -> str:
         """How it stands with the master, in words for a person."""
-        if self._search is not None and not self._client.url:
-            return f"no master: {self._search.outcome}"
+        if self.search is not None and not self._client.url:
+            return f"no master: {self.search.outcome}"
         if self._told.complaint:
             return f"no master: {self._told.complaint}"
         if self._unclear is not None:
@@ -261,8 +264,8 @@ class Uplink:
                 else:
                     await self._report(assignment)
                 retry_s, self._told.complaint = RETRY_MIN_S, ""
-                if self._search is not None:
-                    self._search.answered(self._client.url)
+                if self.search is not None:
+                    self.search.answered(self._client.url)
                 if self.phase == "searching" and self.assignment is not None:
                     self._enter(self.assignment.phase, f"{self._client.url} answers again")
             except MasterRefused as error:
@@ -281,11 +284,11 @@ class Uplink:
 
     async def _turn_to_master(self) -> None:
         """To another one, if another was found; while none is known at all, wait."""
-        if self._search is None:
+        if self.search is None:
             return
         if not self._client.url:
-            self._enter("searching", self._search.outcome)
-        place = await self._search.place()
+            self._enter("searching", self.search.outcome)
+        place = await self.search.place()
         if place.url != self._client.url:
             self._client.aim(place.url)
             self._told.found_by = place.found_by
@@ -293,9 +296,9 @@ class Uplink:
 
     def _miss(self, error: CellwatchError, lost: bool) -> None:
         """What went wrong may mean that the master is elsewhere."""
-        if self._search is not None and lost:
-            self._search.unanswered(monotonic_ns())
-            if self._search.lost:
+        if self.search is not None and lost:
+            self.search.unanswered(self._time.now_ns())
+            if self.search.lost:
                 self._enter("searching", str(error))
 
     def _enter(self, phase: Phase, reason: str) -> None:
@@ -306,7 +309,7 @@ class Uplink:
             self.phase = phase
 
     async def _register(self) -> None:
-        if self._search is None or not self._search.lost:
+        if self.search is None or not self.search.lost:
             self._enter(
                 "registering", f"at {self._client.url}{f', {self._told.found_by}' if self._told.found_by else ''}"
             )
@@ -316,7 +319,7 @@ class Uplink:
         await self._client.authorize()
         told, origin = known_pose or (None, "configured")
         software, boot_id = self._program
-        sent_at_ns = monotonic_ns()
+        sent_at_ns = self._time.now_ns()
         request = InitializeRequest(
             contract=CONTRACT_VERSION,
             contract_minor=CONTRACT_MINOR,
@@ -352,7 +355,7 @@ class Uplink:
 
     def _begin_session(self, slot: InitializeAnswer | SlotAnswer, sent_at_ns: int) -> None:
         """Registered at `sent_at_ns`: what was before is void."""
-        self._session = Session.begun(slot, sent_at_ns)
+        self._session = Session.begun(slot, sent_at_ns, self._time.now_ns())
         self.joints.clear()
         self._ledger.clear()
 
@@ -360,7 +363,7 @@ class Uplink:
         """Do not follow a newer master that is not understood: what is unknown may have to be left unfiltered."""
         theirs, ours = f"{CONTRACT_VERSION}.{slot.contract_minor}", f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
         trouble = Trouble("contract", f"update this unit: it speaks contract {ours}, its master {theirs}: {error}")
-        self._unclear = _Unclear(slot.session, slot.versions, trouble, monotonic_ns())
+        self._unclear = _Unclear(slot.session, slot.versions, trouble, self._time.now_ns())
         level = logging.DEBUG if trouble.sentence == self._told.refused else logging.WARNING
         logger.log(level, "%s", trouble.sentence)
         self._told.refused = trouble.sentence
@@ -370,7 +373,7 @@ class Uplink:
         self._outbox.drop()
         await self._outbox.woken()
         self._outbox.drop()
-        sent_at_ns = monotonic_ns()
+        sent_at_ns = self._time.now_ns()
         if sent_at_ns - unclear.since_ns > CONTRACT_RETRY_S * NS_PER_S:
             self._start_over()
             return
@@ -387,14 +390,14 @@ class Uplink:
                 phase="fetching",
             )
         )
-        self._session.note(sent_at_ns, answer)
+        self._session.note(sent_at_ns, answer, self._time.now_ns())
         if answer.versions != unclear.versions:
             self._start_over()
 
     async def _get_cell(self, reference: CellReference) -> Cell:
         cell = await self._cells.get(reference, self._client)
-        if self._search is not None:
-            await self._search.keep(self._client.url, reference.name)
+        if self.search is not None:
+            await self.search.keep(self._client.url, reference.name)
         return cell
 
     async def _report(self, assignment: Assignment) -> None:
@@ -402,13 +405,13 @@ class Uplink:
         if self._outbox.empty:
             await self._outbox.woken()
         fresh = self._outbox.take()
-        report = fresh or self._last or Report(assignment)
+        report = fresh or self._outbox.last or Report(assignment)
         if report.assignment.session != assignment.session:
             # Made for a session that is over, in which the same versions may have meant something else.
             if fresh is not None:
                 self._outbox.sent(fresh, None)
             report = Report(assignment)
-        self._last = report
+        self._outbox.last = report
         try:
             answer, delivery = await self._exchange_update(assignment, report)
         except CellwatchError:
@@ -430,7 +433,7 @@ class Uplink:
             session.acknowledged = None
         done = self._ledger.ended()
         health = report.health.model_copy(update=self.camera_state.facts())
-        sent_at_ns = monotonic_ns()
+        sent_at_ns = self._time.now_ns()
         answer = await self._client.update(
             UpdateRequest(
                 id=session.id,
@@ -448,7 +451,7 @@ class Uplink:
                 phase=assignment.phase,
             )
         )
-        session.note(sent_at_ns, answer)
+        session.note(sent_at_ns, answer, self._time.now_ns())
         self.joints.add(answer.joints)
         if report.seen is not None:
             session.acknowledged = versions, seen_bits
@@ -491,5 +494,5 @@ class Uplink:
         self._told.complaint = str(error)
         level = logging.WARNING if new or isinstance(error, ConfigError) else logging.DEBUG
         logger.log(level, "%s", error)
-        await asyncio.sleep(retry_s * random.uniform(0.8, 1.2))
+        await sleep(retry_s * random.uniform(0.8, 1.2), self._time)
         return min(2.0 * retry_s, RETRY_MAX_S)

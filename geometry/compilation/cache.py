@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where compiled kernels are kept, settled before the first is imported.
+"""The folder of compiled kernels, chosen before the first kernel is imported.
 
-numba looks for a folder that it can write when a kernel is *defined*, and raises when there is none; so a service
-without a home of its own would not even start. A folder that was filled before but is read-only counts as none.
+numba looks for a writable folder when a kernel is *defined*, and raises when there is none. A service without a home
+of its own would not even start. A folder that was filled before but is now read-only does not count as writable.
 
-It compiles a kernel anew when the kernel's own file has changed, and not when that of a kernel or a constant has which
-it uses. So each state of all the kernels has a folder of its own. Kernels that came with the release are found in it,
-where they fit (`prebuilt`); otherwise they are compiled for this very processor.
+numba recompiles a kernel when the kernel's own file has changed, but not when another kernel or constant that it uses
+has. So each state of the kernels' source has a folder of its own. Kernels shipped with the release are linked into it
+if they fit (`prebuilt`); otherwise they are compiled for this processor.
 
-It waits for no disk when it writes, and takes what it finds for whole: after a power cut it would raise at each start.
-So files that are empty or cut short are taken out, and compiled anew.
+numba does not flush its files to the disk, and does not check them: a file damaged by a power cut would raise at each
+start. So empty and truncated files are removed, and their kernels compiled again.
 """
 
 from __future__ import annotations
@@ -38,24 +38,25 @@ VARIABLES = ("CELLWATCH_JIT_CACHE", NUMBA_VARIABLE)
 KERNELS = Path(__file__).resolve().parents[1] / "kernels"
 
 STATES_MAX = 3
-"""States of the kernels that are kept: this one, and what one may go back to."""
+"""Number of states kept: the current one, and earlier ones for a rollback."""
 
 PRIVATE = "cellwatch-jit-"
-"""Of a temporary folder, which is gone after the next boot."""
+"""Prefix of a temporary folder, which is gone after the next boot."""
 
 
 def settle(directory: Path | str | None = None) -> Path:
-    """Choose the folder for compiled kernels; call it before any kernel is imported.
+    """Choose the folder for compiled kernels, and return it; call this before any kernel is imported.
 
-    In `directory`, else `$CELLWATCH_JIT_CACHE`, else `$NUMBA_CACHE_DIR`, else where numba would, if it can be written;
-    else in a private temporary folder, with a warning. Returns the folder of the kernels as they are.
+    Use the first that is set of `directory`, `$CELLWATCH_JIT_CACHE`, `$NUMBA_CACHE_DIR` and numba's own choices. If it
+    cannot be written, use a private temporary folder and log a warning. The result is the subfolder for the current
+    state of the kernels.
 
     Raises:
-        JitCacheError: not even a temporary folder can be made, or the kernels' source is not found.
+        JitCacheError: not even a temporary folder can be created, or the kernels' source is missing.
     """
     wanted = next((Path(name) for name in (directory, *map(os.environ.get, VARIABLES)) if name), None)
     if wanted is not None and wanted.name.startswith(PREFIX):
-        # Handed down by a process that has settled already.
+        # Inherited from a process that has already chosen.
         wanted = wanted.parent
     if wanted is not None and _writable(wanted):
         return _use(wanted)
@@ -73,21 +74,21 @@ def settle(directory: Path | str | None = None) -> Path:
 
 
 def folder_beside(name: str) -> Path:
-    """Return the folder `name` beside those of the kernels, wherever they were settled; it need not exist."""
+    """Return the folder `name` beside those of the kernels; it need not exist."""
     return Path(os.environ[NUMBA_VARIABLE]).parent / name
 
 
 def settle_for(target: Target, directory: Path) -> Path:
-    """Have all kernels compiled for `target`, to be carried by a release, into a folder below `directory`.
+    """Compile all kernels from now on for `target`, for shipping with a release, into a folder below `directory`.
 
     Raises:
-        JitCacheError: it cannot be written, or the kernels' source is not found.
+        JitCacheError: the folder cannot be written, or the kernels' source is missing.
     """
     folder = directory / target.name / f"{PREFIX}{_state()}"
     if not _writable(folder):
         raise JitCacheError(f"{folder} cannot be written")
     target.choose()
-    _tell_numba(folder)
+    _set_numba_folder(folder)
     return folder
 
 
@@ -97,36 +98,36 @@ def _use(parent: Path) -> Path:
     found = carried(state)
     if found is not None:
         target, kernels = found
-        # Where not even links can be made, it is compiled for this processor.
+        # If links cannot be created, compile for this processor.
         with suppress(OSError):
             folder = link(kernels, parent)
             target.choose()
     with suppress(OSError):
-        # A folder that another process is taking out at the same time is as good as taken out.
+        # Another process may remove the same folder at the same time.
         folder.mkdir(exist_ok=True)
         os.utime(folder)
         states = sorted(parent.glob(f"{PREFIX}*"), key=lambda path: path.stat().st_mtime)
-        # What a power cut left of a folder of links; one that is being made is younger than any state.
+        # Folders of links left by a power cut; a folder that is being filled is younger than any state.
         left_behind = [path for path in parent.glob(f"{PARTIAL}*") if path.stat().st_mtime < states[0].stat().st_mtime]
         for old in (*states[:-STATES_MAX], *left_behind):
             shutil.rmtree(old, ignore_errors=True)
-    _take_out_damaged(folder)
-    _tell_numba(folder)
+    _remove_damaged(folder)
+    _set_numba_folder(folder)
     return folder
 
 
-def _take_out_damaged(folder: Path) -> None:
+def _remove_damaged(folder: Path) -> None:
     for file in folder.glob("*/*.nb[ic]"):
         try:
             if not _is_whole(file.read_bytes()):
-                logger.warning("%s: damaged, its kernel is compiled anew", file)
+                logger.warning("%s: damaged; its kernel will be compiled again", file)
                 file.unlink(missing_ok=True)
         except OSError as error:
-            logger.warning("%s: a compiled kernel cannot be read: %s", file, error)
+            logger.warning("%s: cannot read this compiled kernel: %s", file, error)
 
 
 def _is_whole(content: bytes) -> bool:
-    """Whether it is one pickle after another to its end; none of them is loaded."""
+    """Return True if `content` is a sequence of complete pickles; do not load them."""
     stream = BytesIO(content)
     try:
         for _ in pickletools.genops(stream):
@@ -139,10 +140,10 @@ def _is_whole(content: bytes) -> bool:
     return True
 
 
-def _tell_numba(folder: Path) -> None:
+def _set_numba_folder(folder: Path) -> None:
     os.environ[NUMBA_VARIABLE] = str(folder)
     if "numba" in sys.modules:
-        # It reads the variable only when it is imported.
+        # numba reads the variable only at its import.
         import numba
 
         numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]  # numba sets its options from outside
@@ -152,11 +153,11 @@ def _state() -> str:
     try:
         return state_of_kernels()
     except OSError as error:
-        raise JitCacheError(f"compiled kernels cannot be told apart: {error}") from error
+        raise JitCacheError(f"no digest of the kernels' source: {error}") from error
 
 
 def _numba_choices() -> list[Path]:
-    """Where numba looks by itself: beside the source, then in the user's cache."""
+    """Return numba's own choices: beside the source, then in the user's cache."""
     beside = KERNELS / "__pycache__"
     cache_home = os.environ.get("XDG_CACHE_HOME")
     try:
@@ -166,7 +167,7 @@ def _numba_choices() -> list[Path]:
 
 
 def _writable(folder: Path) -> bool:
-    """Whether a file can really be made there; permissions alone do not tell of read-only file systems."""
+    """Return True if a file can really be created there; permissions do not show a read-only file system."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -176,7 +177,7 @@ def _writable(folder: Path) -> bool:
 
 
 def _private_folder() -> Path:
-    """A folder that only this user can have filled, the same at each start where possible: kernels are code."""
+    """Return a folder that only this user can have filled, if possible the same at each start: kernels are code."""
     try:
         folder = Path(tempfile.gettempdir()) / f"{PRIVATE}{os.getuid()}"
         folder.mkdir(mode=0o700, exist_ok=True)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state of the kernels' source: it changes whenever any kernel does.
+"""Digest of the kernels' source, which changes with any kernel.
 
-numba notices a changed kernel by the time and size of its own file. Both may be equal in two releases, since an image
-gives every source one time, and a constant in another file is not looked at. So compiled kernels lie in a folder that
-is named by this state.
+numba detects a changed kernel by the time and size of its own file. Both can be equal in two releases, since an image
+sets one time for all files, and numba ignores constants in other files. So the folder of compiled kernels is named by
+this digest.
 
-`python3 kernel_state.py` prints it. That takes nothing but Python itself, so whoever builds an image asks the release
-for the state of its kernels, on whatever computer.
+`python3 kernel_state.py` prints it. It needs only Python, so the build of an image can ask a release for its digest on
+any computer.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import sys
 from pathlib import Path
 
 PLACE = Path(__file__).resolve().parents[2]
-"""The folder that the packages lie in."""
+"""The folder that contains the packages."""
 
 FOLDERS = ("geometry/kernels", "simulation/cameras")
-"""Every folder, below `PLACE`, with functions that numba compiles and keeps."""
+"""All folders below `PLACE` with functions that numba compiles and caches."""
 
 DIGITS = 12
-"""Of the digest: enough for the few states that a computer ever meets."""
+"""Length of the digest: enough for the few states that a computer ever has."""
 
 
 def state_of_kernels(place: Path = PLACE) -> str:
-    """Return the state of all kernels below `place`, as hexadecimal digits.
+    """Return the digest of all kernels below `place`, as hexadecimal digits.
 
     Raises:
-        FileNotFoundError: a folder holds no kernel; a state without them would never change.
+        FileNotFoundError: a folder has no kernel; a digest without kernels would never change.
     """
     digest = hashlib.sha256()
     for folder in FOLDERS:
@@ -43,7 +43,7 @@ def state_of_kernels(place: Path = PLACE) -> str:
 
 
 def main() -> int:
-    """Print the state; exit code 1, with a sentence, where there are no kernels."""
+    """Print the digest; exit code 1 with a message if there are no kernels."""
     try:
         print(state_of_kernels())
     except OSError as error:

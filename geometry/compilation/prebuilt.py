@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled kernels that came with the release, for a named processor that many boards have in common.
+"""Compiled kernels shipped with a release, for a named processor that many boards share.
 
-numba keeps a kernel under the name of the processor that it was compiled for, and asks the environment for that name
-before it asks the processor. So what was compiled under a name on one computer is found under the same name on all.
-They lie in `$CELLWATCH_CARRIED_KERNELS/TARGET/kernels-STATE`, read-only; each kernel is used through a link in the
-folder that numba may write, and one that fits no more is compiled anew in the link's place.
+numba stores a kernel under the name of its target processor, and takes that name from the environment before it asks
+the processor. So kernels compiled under a name on one computer are found under the same name on all. They are in
+`$CELLWATCH_CARRIED_KERNELS/TARGET/kernels-STATE`, read-only. Each kernel is used through a link in the folder that
+numba can write; a kernel that no longer fits is compiled again in place of its link.
 """
 
 from __future__ import annotations
@@ -20,36 +20,36 @@ from pathlib import Path
 VARIABLE = "CELLWATCH_CARRIED_KERNELS"
 
 PREFIX = "kernels-"
-"""Of the folders' names; the rest is a digest of the source, and where they were carried from if they were."""
+"""Prefix of the folders' names; the digest of the source follows, and a digest of the origin for shipped kernels."""
 
 PARTIAL = f"partial-{PREFIX}"
-"""Of a folder of links that is being made; by its name it is none of the states that are kept."""
+"""Prefix of an incomplete folder of links; the name excludes it from the states that are kept."""
 
 CPUINFO = Path("/proc/cpuinfo")
 
 FLAGS_LINES = {"aarch64": "Features", "x86_64": "flags"}
-"""What the line is called in which Linux tells the abilities of a processor."""
+"""Name of the line of /proc/cpuinfo with the features of the processor."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A kind of processor, as Linux and as the compiler know it."""
+    """A kind of processor, with its names in Linux and in the compiler."""
 
     name: str
     machine: str
     cpu: str
     flags: frozenset[str]
-    """What it must be able to do, in the words of /proc/cpuinfo."""
+    """Required features, as named in /proc/cpuinfo."""
 
     def runs_here(self) -> bool:
-        """Whether every core of this computer can do what the kernels may ask for."""
+        """Return True if every core of this computer has the required features."""
         return platform.machine() == self.machine and self.flags <= _flags(self.machine)
 
     def choose(self) -> None:
-        """Have numba compile for it, and find what was compiled for it, from now on."""
+        """Make numba compile for this target from now on, and find kernels compiled for it."""
         os.environ["NUMBA_CPU_NAME"], os.environ["NUMBA_CPU_FEATURES"] = self.cpu, ""
         if "numba" in sys.modules:
-            # It reads the variables only when it is imported.
+            # numba reads the variables only at its import.
             import numba
 
             numba.config.CPU_NAME, numba.config.CPU_FEATURES = self.cpu, ""  # type: ignore[attr-defined]  # set from outside
@@ -59,19 +59,19 @@ ARMV8_2_A = "fp asimd aes pmull sha1 sha2 crc32 atomics fphp asimdhp asimdrdm lr
 X86_64_V3 = "cx16 lahf_lm popcnt pni ssse3 sse4_1 sse4_2 avx avx2 bmi1 bmi2 f16c fma abm movbe xsave"
 
 TARGETS = (
-    # Jetson Orin (Cortex-A78AE) and Thor (Neoverse V3AE) can do all that a Cortex-A76 can; emulators know it as well.
+    # Jetson Orin (Cortex-A78AE) and Thor (Neoverse V3AE) have all features of a Cortex-A76; emulators support it too.
     Target("armv8.2-a", "aarch64", "cortex-a76", frozenset(ARMV8_2_A.split())),
     Target("x86-64-v3", "x86_64", "x86-64-v3", frozenset(X86_64_V3.split())),
 )
 
 
 def target_of(machine: str) -> Target | None:
-    """What kernels are compiled for that go to boards with such a processor; None where there is nothing in common."""
+    """Return the target for boards with such a processor, or None if they share none."""
     return next((target for target in TARGETS if target.machine == machine), None)
 
 
 def carried(state: str) -> tuple[Target, Path] | None:
-    """The kernels of this `state` that came with the release and fit this processor, if any did."""
+    """Return the target and the folder of shipped kernels of this `state`, if they exist and fit this processor."""
     folder = os.environ.get(VARIABLE)
     target = target_of(platform.machine())
     if not folder or target is None or os.environ.get("NUMBA_CPU_NAME", target.cpu) != target.cpu:
@@ -81,10 +81,10 @@ def carried(state: str) -> tuple[Target, Path] | None:
 
 
 def link(kernels: Path, parent: Path) -> Path:
-    """A folder in `parent` with a link to each of the `kernels`; it is there as a whole or not at all.
+    """Create a folder in `parent` with a link to each of the `kernels`, atomically, and return it.
 
     Raises:
-        OSError: it cannot be made.
+        OSError: the folder cannot be created.
     """
     place = hashlib.sha256(bytes(kernels)).hexdigest()[:8]
     folder = parent / f"{kernels.name}-{place}"
@@ -98,14 +98,14 @@ def link(kernels: Path, parent: Path) -> Path:
             try:
                 whole.rename(folder)
             except OSError:
-                # Another process may have been sooner, with the same links.
+                # Another process may have created the same links before.
                 if not folder.is_dir():
                     raise
     return folder
 
 
 def _flags(machine: str) -> frozenset[str]:
-    """What all cores can do."""
+    """Return the features that all cores have."""
     try:
         lines = CPUINFO.read_text(encoding="ascii", errors="replace").splitlines()
     except OSError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well measured depth fits expected depth: what tells a covered or a knocked camera from an empty cell."""
+"""Agreement of measured with expected depth; it distinguishes a covered or moved camera from an empty cell."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from geometry.kernels.jit import kernel
 
 RESIDUAL_BINS = 201
-"""Residuals are binned by a hundredth of the tolerance, from minus to plus one tolerance."""
+"""Number of residual bins, each a hundredth of the tolerance wide, from minus to plus one tolerance."""
 
 
 class Tolerance(NamedTuple):
-    """How far a depth may lie from another: `base_raw + per_raw2 * z**2`, in raw units."""
+    """Tolerance between two depths at depth z: `base_raw + per_raw2 * z**2`, in raw units."""
 
     base_raw: float
     per_raw2: float
@@ -31,12 +31,12 @@ def compare(
     residual_bins: NDArray[np.int64],
     tallies: NDArray[np.int64],
 ) -> None:
-    """Compare every `stride_px`-th pixel with the static surface that is expected there.
+    """Compare every `stride_px`-th pixel with the expected static surface.
 
-    `static_raw` (H, W) is the expected raw depth, 0 where nothing is known; pixels that the robot may cover are left
-    out. A pixel agrees when it is within its tolerance of it. Out: `tallies` (4,) =
-    pixels looked at, of these measured, measured where a static surface is expected, of these agreeing; `residual_bins`
-    (RESIDUAL_BINS,) the residuals of those that agree, in hundredths of their tolerance.
+    `static_raw` (H, W) is the expected raw depth, 0 if not known. Pixels that the robot may cover are left out. A pixel
+    agrees if it is within the tolerance of the expected depth. Out: `tallies` (4,), the counts of sampled pixels, of
+    measured ones, of measured ones with a static surface expected, and of those the agreeing ones; `residual_bins`
+    (RESIDUAL_BINS,), the histogram of residuals of agreeing pixels, in hundredths of their tolerance.
     """
     tolerance = Tolerance(*tolerance)
     residual_bins[:] = 0

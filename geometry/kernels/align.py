@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far measured points lie from the planes that they should lie on, as seen from a pose."""
+"""Distances of measured points from the expected planes, for a camera at a given pose."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from geometry.kernels.jit import kernel
 from geometry.kernels.pinhole import Camera, deproject, in_32, moved, nearest_pixel, project, rows_of, rows_of_32
 
 UNKNOWN_COST = 0.5
-"""Of a point that falls where nothing is known: neither does it fit, nor does it not."""
+"""Cost of a point without a known surface: it neither agrees nor disagrees."""
 
 
 class Planes(NamedTuple):
-    """What `camera` should see.
+    """Planes that `camera` is expected to see.
 
-    `depth_m` (H, W), inf where nothing is known; a depth's difference times `obliqueness` (H, W) is the distance from
-    the plane there; `normals` (H, W, 3) of the planes in the camera frame, NaN at edges.
+    `depth_m` (H, W), inf if not known. A difference of depths times `obliqueness` (H, W) is the distance from the plane
+    at that pixel. `normals` (H, W, 3) of the planes in the camera frame, NaN at edges.
     """
 
     depth_m: NDArray[np.float32]
@@ -28,7 +28,7 @@ class Planes(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """N points (3, N) in the frame of the camera that measured them, with the `scale_m` (N,) of their distances."""
+    """N points (3, N) in the frame of the measuring camera, with the scale `scale_m` (N,) of their distances."""
 
     points_m: NDArray[np.float32]
     scale_m: NDArray[np.float32]
@@ -42,11 +42,11 @@ def plane_cost(
     T_expected_there: NDArray[np.float64],
     distances_m: NDArray[np.float32],
 ) -> float:
-    """Robust sum of the points' distances from the expected planes, if the camera stood elsewhere.
+    """Return the robust sum of the points' distances from the expected planes, for a camera at another pose.
 
-    `T_expected_there` (4, 4) maps points of a camera that stands there into the frame that was expected. A distance `d`
-    counts `d**2 / (scale**2 + d**2)`, so that what is unknown and near counts 1 wherever the camera stands.
-    Out: `distances_m` (N,), NaN where nothing is known.
+    `T_expected_there` (4, 4) maps points from the frame of the camera at that pose into the frame of `expected`. A
+    distance `d` costs `d**2 / (scale**2 + d**2)` (Geman and McClure), so an unknown obstacle nearby costs at most 1 at
+    every pose. Out: `distances_m` (N,), NaN if not known.
     """
     measured, expected = Measured(*measured), Planes(*expected)
     points_m, scale_m, depth_m = measured.points_m, measured.scale_m, expected.depth_m
@@ -82,9 +82,9 @@ def normal_equations(
     information: NDArray[np.float64],
     gradient: NDArray[np.float64],
 ) -> None:
-    """Gauss and Newton's equations of `plane_cost` for a small motion of the camera in the expected frame.
+    """Compute the Gauss-Newton equations of `plane_cost` for a small motion of the camera in the expected frame.
 
-    Out: `information` (6, 6) and `gradient` (6,) of the turn and then the shift, both weighted by the robust cost.
+    Out: `information` (6, 6) and `gradient` (6,) of the rotation, then the translation, weighted by the robust cost.
     """
     measured, expected, camera = Measured(*measured), Planes(*expected), Camera(*camera)
     points_m, scale_m, normals = measured.points_m, measured.scale_m, expected.normals

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How bundles, named tuples of arrays and numbers, are handed to kernels.
+"""Bundles are named tuples of arrays and numbers; this module converts them for kernels.
 
 A bundle is defined beside the kernel that owns it.
 """
@@ -12,9 +12,9 @@ Bundle = TypeVar("Bundle", bound=tuple[Any, ...])
 
 
 def plain(bundle: Bundle) -> Bundle:
-    """A bundle as the plain tuple of its values, which is how a kernel takes it from Python.
+    """Return a bundle as the plain tuple of its values, the form in which Python passes it to a kernel.
 
-    Of a named tuple numba reads the names of class and fields at every call, which costs up to a microsecond a bundle;
-    of a plain one, next to nothing. A kernel that Python calls names its bundles again: `band = Band(*band)`.
+    For a named tuple, numba reads the names of class and fields at every call, which costs up to a microsecond a
+    bundle; a plain tuple costs almost nothing. A kernel called from Python restores the names: `band = Band(*band)`.
     """
     return cast(Bundle, tuple(bundle))

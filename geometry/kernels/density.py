@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Voxels with too few points are noise (the paper's Algorithms 6 and 7, and our departure).
+"""Removal of voxels with too few points as noise (the paper's Algorithms 6 and 7, and our departure).
 
-The paper deletes each voxel that holds less than a share of the points that a full one would show at its
-distance; a flat hand on a border is thus split into two halves and disappears. Here the points of the 27 voxels
-around decide, and a voxel by itself only needs a small share.
+The paper deletes each voxel with less than a share of the points of a full one at its distance. A flat hand on a border
+between voxels is then split into two halves and disappears. Here the points of the 27 voxels around decide, and the
+voxel itself needs only a small share.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from geometry.kernels.jit import kernel
 
 FLOOR_VOXELS = 3.0
-"""The floor of points never asks for more than this many full voxels: small voxels far away hold few points, and a
-surface that crosses the neighbourhood fills about nine."""
+"""Limit of the least number of points, in full voxels: small voxels far away hold few points, and a surface that
+crosses the neighbourhood fills about nine."""
 
 AT_ONCE = 256
-"""So many voxels are located before they are judged: enough for the vectoriser, and they stay in the first cache."""
+"""Voxels located at once before the decision: enough for the vectoriser, and they fit the first-level cache."""
 
 
 class View(NamedTuple):
-    """The voxels of a lattice of `shape` (3,) before one camera.
+    """The voxels of a lattice of `shape` (3,) in the frame of one camera.
 
-    `first_centre_camera_m` (3,) is the middle of voxel (0, 0, 0) in the camera frame, and `axes_camera` (3, 3) has as
-    columns the steps to the next voxel along each lattice axis.
+    `first_centre_camera_m` (3,) is the centre of voxel (0, 0, 0) in the camera frame. The columns of `axes_camera`
+    (3, 3) are the steps to the next voxel along each lattice axis.
     """
 
     shape: NDArray[np.int32]
@@ -42,12 +42,12 @@ class View(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """What a voxel must hold.
+    """Points required in a voxel.
 
-    `angular` takes the paper's Algorithm 6 for a full one. `single` is its Algorithm 7: a voxel's own count against
-    `threshold` of the full count. Else the 27-neighbourhood is held against `threshold` of the full count of at most
-    `support_area_max_m2`, but no less than `support_points_min` or `FLOOR_VOXELS` full voxels, and the voxel's own
-    against `own_share_min`.
+    `angular` selects the paper's Algorithm 6 for the full count. `single` selects Algorithm 7: a voxel's own count is
+    compared with `threshold` of the full count. Otherwise the count of the 27-neighbourhood is compared with
+    `threshold` of the full count of at most `support_area_max_m2`, but no less than `support_points_min` or
+    `FLOOR_VOXELS` full voxels, and the voxel's own count with `own_share_min`.
     """
 
     angular: bool
@@ -59,9 +59,9 @@ class Rule(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """`keys` and `counts` of the voxels that are kept, at least one longer than may be.
+    """`keys` and `counts` of the voxels kept; the arrays are at least one longer than the largest result.
 
-    Scratch of those that are judged: `judged` (6, AT_ONCE) and `judged_keys` (AT_ONCE,).
+    Scratch for the voxels under test: `judged` (6, AT_ONCE) and `judged_keys` (AT_ONCE,).
     """
 
     keys: NDArray[np.uint32]
@@ -71,7 +71,7 @@ class Kept(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """What a few voxels hold with their neighbours, and what they must hold by themselves and with them."""
+    """Points of a few voxels with their neighbours, and the required counts of the voxel alone and with neighbours."""
 
     around: NDArray[np.float64]
     own_needed: NDArray[np.float64]
@@ -80,14 +80,14 @@ class Asked(NamedTuple):
 
 @kernel
 def expected_pinhole(size_m: float, z_m: float, fx: float, fy: float) -> float:
-    """Points that a square of `size_m` facing the camera at depth `z_m` shows."""
+    """Return the number of points of a square of `size_m` that faces the camera at depth `z_m`."""
     side = size_m / max(z_m, 1e-3)
     return fx * fy * side * side
 
 
 @kernel
 def expected_angular(size_m: float, distance_m: float, degrees_per_column: float, degrees_per_row: float) -> float:
-    """The paper's Algorithm 6: the same from degrees per pixel, averaged over the whole view."""
+    """Return the same by the paper's Algorithm 6: from degrees per pixel, averaged over the whole view."""
     angle_deg = math.degrees(math.atan(size_m / max(distance_m, 1e-3)))
     return (angle_deg / degrees_per_column) * (angle_deg / degrees_per_row)
 
@@ -96,7 +96,7 @@ def expected_angular(size_m: float, distance_m: float, degrees_per_column: float
 def neighbourhood_count(
     counts: NDArray[np.uint32], slot: np.uint64, slots_per_y: np.uint64, slots_per_x: np.uint64
 ) -> int:
-    """Points in the 27 voxels around a slot of the counter with its rim, see `voxelize`."""
+    """Return the points in the 27 voxels around a slot of the counter with its rim (see `voxelize`)."""
     total = np.uint32(0)
     for jx in range(3):
         for jy in range(3):
@@ -114,10 +114,10 @@ def locate(
     z_m: NDArray[np.float64],
     distance_m: NDArray[np.float64],
 ) -> None:
-    """Of each of a few slots the key of its voxel, and the depth and distance of the voxel's middle from the camera.
+    """Compute the key of the voxel of each slot, and the depth and distance of the voxel's centre from the camera.
 
-    Written for the vectoriser: without divisions of integers, which it cannot do. A slot is below 2**28: the half that
-    is added outweighs the rounding of the inverse.
+    Written for the vectoriser, which cannot divide integers: it divides in floating point. A slot is below 2**28, and
+    the added half outweighs the rounding of the inverse.
     """
     view = View(*view)
     shape, first_centre_camera_m, axes_camera = view.shape, view.first_centre_camera_m, view.axes_camera
@@ -144,7 +144,7 @@ def locate(
 
 @kernel
 def fill_pinhole(view: View, z_m: NDArray[np.float64], full: NDArray[np.float64]) -> None:
-    """`expected_pinhole` of each; alone in its function, it is vectorised."""
+    """Fill `full` by `expected_pinhole`; a function of its own so that it is vectorised."""
     size_m, fx, fy = view.voxel_size_m, view.fx, view.fy
     for i in range(len(z_m)):
         full[i] = expected_pinhole(size_m, z_m[i], fx, fy)
@@ -152,14 +152,14 @@ def fill_pinhole(view: View, z_m: NDArray[np.float64], full: NDArray[np.float64]
 
 @kernel
 def fill_angular(view: View, distance_m: NDArray[np.float64], full: NDArray[np.float64]) -> None:
-    """`expected_angular` of each."""
+    """Fill `full` by `expected_angular`."""
     for i in range(len(distance_m)):
         full[i] = expected_angular(view.voxel_size_m, distance_m[i], view.degrees_per_column, view.degrees_per_row)
 
 
 @kernel
 def demand(full: NDArray[np.float64], rule: Rule, share: float, asked: Asked) -> None:
-    """What a voxel must hold by itself, and with its 26 neighbours; `share` of a full one is asked at most."""
+    """Compute the counts required of a voxel alone and with its 26 neighbours; `share` limits the area required."""
     own_needed, needed = asked.own_needed, asked.needed
     own_share = rule.threshold if rule.single else rule.own_share_min
     around_share = 0.0 if rule.single else rule.threshold * share
@@ -177,7 +177,7 @@ def sum_around(
     slots_per_x: np.uint64,
     around: NDArray[np.float64],
 ) -> None:
-    """`neighbourhood_count` of each; apart from the decision, so that no wrong guess of it stops the loads."""
+    """Fill `around` by `neighbourhood_count`; apart from the decision, so that branch misses do not stall the loads."""
     for i in range(len(slots)):
         around[i] = neighbourhood_count(counts, np.uint64(slots[i]), slots_per_y, slots_per_x)
 
@@ -191,13 +191,13 @@ def pick(
     kept: NDArray[np.uint32],
     kept_counts: NDArray[np.uint32],
 ) -> int:
-    """List the keys and counts of those `slots` that hold what is needed; returns how many."""
+    """List the keys and counts of those `slots` that have the required counts; return their number."""
     around, own_needed, needed = asked
-    # Unsigned, for a signed index is tested for counting from the end.
+    # Unsigned, since numba tests a signed index for counting from the end.
     number = np.uint64(0)
     for i in range(len(slots)):
         own = counts[slots[i]]
-        # Written always and kept when it is dense: a branch would be guessed wrong too often.
+        # Always written, and counted only if dense: a branch would be mispredicted too often.
         kept[number] = keys[i]
         kept_counts[number] = own
         number += np.uint64((own >= own_needed[i]) & (around[i] >= needed[i]))
@@ -208,10 +208,10 @@ def pick(
 def keep_dense(
     counts: NDArray[np.uint32], touched: NDArray[np.uint32], found: int, view: View, rule: Rule, kept: Kept
 ) -> int:
-    """List the touched voxels that are dense enough in `kept`, in the order of `touched`; returns how many.
+    """List the touched voxels that are dense enough in `kept`, in the order of `touched`; return their number.
 
-    The `found` of `touched` are slots of the counter with its rim; in ascending order, neighbours are found in the
-    cache.
+    The first `found` entries of `touched` are slots of the counter with its rim. In ascending order, neighbours are in
+    the cache.
     """
     view, rule, kept = View(*view), Rule(*rule), Kept(*kept)
     slots_per_y = np.uint64(view.shape[2] + 2)

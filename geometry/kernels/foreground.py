@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pixels that nothing known explains: one pass at memory speed."""
+"""Mask of the pixels that no known surface explains: one pass at memory speed."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def foreground_mask(
 ) -> None:
     """Mark pixels that are nearer than the static limit and not robot.
 
-    All images (H, W); `mask` (H, at least W) gets 1 or 0. `room_raw` is the static limit less `minimum_raw`, or 0;
-    depths below `minimum_raw` (at least 1, for 0 is no measurement) are never foreground.
+    All images are (H, W); `mask` (H, at least W) gets 1 or 0. `room_raw` is the static limit less `minimum_raw`, at
+    least 0. Depths below `minimum_raw` (at least 1, since 0 is no measurement) are never foreground.
 
-    Both bounds are one unsigned compare, for `low <= d < high` is `d - low < high - low` modulo 2**16.
+    Both bounds are one unsigned comparison: `low <= d < high` is `d - low < high - low` modulo 2**16.
     """
     robot = Band(*robot)
     low = np.uint16(minimum_raw)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the links stand, and how far they may be off (the paper's Algorithm 5).
+"""Poses of the links, and bounds of their errors (the paper's Algorithm 5).
 
-The arithmetic of `shared.kinematics`, which explains it, in one call instead of fifty of numpy's: those cost a tenth of
-a millisecond a frame, and three times that in a cold cache. Arrays are those of `shared.kinematics.LinkTable`.
+The same computation as `shared.kinematics`, which explains it, in one call instead of fifty of numpy. Those would cost
+a tenth of a millisecond a frame, and three times that in a cold cache. Arrays are those of
+`shared.kinematics.LinkTable`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from geometry.kernels.jit import kernel
 
 
 class Moving(NamedTuple):
-    """The moving joints: what `shared.kinematics.LinkTable` has of each of J."""
+    """The moving joints: the arrays of `shared.kinematics.LinkTable` over J."""
 
     parent: NDArray[np.int64]
     dof: NDArray[np.int64]
@@ -32,7 +33,7 @@ class Moving(NamedTuple):
 
 
 class Carried(NamedTuple):
-    """The links that hang on them: what it has of each of L."""
+    """The links on the joints: the arrays of `shared.kinematics.LinkTable` over L."""
 
     body: NDArray[np.int64]
     T_body_link: NDArray[np.float64]
@@ -41,7 +42,7 @@ class Carried(NamedTuple):
 
 
 class Stand(NamedTuple):
-    """Where they stand: `poses` (L, 4, 4) `T_camera_link`, and `bodies` (J + 1, 4, 4) `T_camera_body`, the base last.
+    """Computed poses: `poses` (L, 4, 4) `T_camera_link`, and `bodies` (J + 1, 4, 4) `T_camera_body`, the base last.
 
     `local` (4, 4) is scratch.
     """
@@ -53,7 +54,7 @@ class Stand(NamedTuple):
 
 @kernel
 def multiply(a: NDArray[np.float64], b: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """The product (4, 4) of two rigid transforms."""
+    """Multiply two rigid transforms (4, 4)."""
     for i in range(3):
         for j in range(4):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j] + a[i, 3] * b[3, j]
@@ -64,7 +65,7 @@ def multiply(a: NDArray[np.float64], b: NDArray[np.float64], out: NDArray[np.flo
 def place_links(
     joints: NDArray[np.float64], T_camera_base: NDArray[np.float64], moving: Moving, carried: Carried, stand: Stand
 ) -> None:
-    """Fill `stand` at joint positions (n,), rad or m."""
+    """Fill `stand` for joint positions (n,), rad or m."""
     moving, carried, stand = Moving(*moving), Carried(*carried), Stand(*stand)
     parent, dof, multiplier, offset, is_turning, _, fixed, sine, versine, shift = moving
     body, bodies, local = carried.body, stand.bodies, stand.local
@@ -90,9 +91,9 @@ def displace_links(
     stand: Stand,
     displacement_m: NDArray[np.float64],
 ) -> None:
-    """How far (L,) any point of each link moves at most when joints are off by `uncertainty` (n,), rad or m.
+    """Compute the largest motion (L,) of any point of each link for joint errors of `uncertainty` (n,), rad or m.
 
-    `stand` is what `place_links` filled; see `shared.kinematics.Robot.displacement_m`.
+    `stand` was filled by `place_links`; see `shared.kinematics.Robot.displacement_m`.
     """
     moving, carried, stand = Moving(*moving), Carried(*carried), Stand(*stand)
     dof, multiplier, is_turning, axis = moving.dof, moving.multiplier, moving.is_turning, moving.axis

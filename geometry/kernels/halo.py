@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The halo of stereo matching around what stands still: beside an edge the camera measures the edge's own depth.
+"""The halo of stereo matching around static edges: beside an edge the camera measures the depth of the edge.
 
-Matching compares windows, and one that holds a strong edge takes that edge's disparity even when its middle lies
-beside it; so known things look some centimetres wider than they are. Only depths about the edge's own are explained
-by it: what stands well before or behind the edge is seen as ever.
+Matching compares windows. A window with a strong edge takes the disparity of that edge even when its centre is beside
+it, so known objects look some centimetres wider than they are. The halo explains only depths near that of the edge:
+objects well before or behind the edge are seen as usual.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from geometry.kernels.limits import RAW_MAX, less_noise
 from geometry.kernels.pinhole import Camera
 
 STEP_SHARE = 0.5
-"""A step of half a margin is an edge: beyond a smaller one the margin behind it holds the halo, too."""
+"""Least depth step of an edge, in margins: for a smaller step, the margin of the surface behind contains the halo."""
 
 
 class Margin(NamedTuple):
-    """What an edge's depth may be off by: `base_m + noise_per_m * z**2`."""
+    """Margin of an edge's depth: `base_m + noise_per_m * z**2`."""
 
     base_m: float
     noise_per_m: float
 
 
 class Halo(NamedTuple):
-    """The pixels that have a halo, in `runs` (R, 4) of neighbours in a row, and the band of raw depths of each.
+    """Pixels with a halo, in `runs` (R, 4) of neighbours in a row, and the band of raw depths of each pixel.
 
-    A run is its row, its first column, and the first of its bands in `near_raw` and `span_raw` (N,), lower end and
-    length, and the one after its last.
+    A run is its row, its first column, the index of its first band in `near_raw` and `span_raw` (N,), which are lower
+    end and length, and the index after its last.
     """
 
     runs: NDArray[np.int32]
@@ -50,11 +50,11 @@ def spread_edges(
     nearest_w: NDArray[np.float32],
     farthest_w: NDArray[np.float32],
 ) -> int:
-    """Let the edges of `cad_w` (H, W), 1/z of the nearest surface and 0 for none, reach over what lies behind them.
+    """Spread the edges of `cad_w` (H, W), 1/z of the nearest surface and 0 for none, over the pixels behind them.
 
-    An edge reaches `padding_m` at its own depth. It is a pixel beside one that lies farther by `STEP_SHARE` of its
-    margin. Out (H, W): 1/z of the nearest and of the farthest edge that reaches over a pixel,
-    0 where none does. Returns the number of pixels that one reaches.
+    An edge is a pixel beside one that is farther by `STEP_SHARE` of its margin. It reaches `padding_m` at its own
+    depth. Out (H, W): 1/z of the nearest and of the farthest edge that reaches a pixel, 0 for none. Returns the number
+    of pixels reached.
     """
     margin, camera = Margin(*margin), Camera(*camera)
     height, width = cad_w.shape
@@ -99,10 +99,10 @@ def halo_bands(
     near_raw: NDArray[np.uint16],
     span_raw: NDArray[np.uint16],
 ) -> None:
-    """List the pixels that an edge reaches, and the band of raw depths that belongs to it there.
+    """List the pixels that an edge reaches, with their bands of raw depths.
 
-    From the nearest edge less its margin to the farthest edge plus its margin, as lower end and length. Out (N,), N
-    being what `spread_edges` returned; a pixel is `y * W + x`.
+    A band extends from the nearest edge less its margin to the farthest edge plus its margin, as lower end and length.
+    Out (N,), where N is the result of `spread_edges`; a pixel is `y * W + x`.
     """
     base_m, noise_per_m = Margin(*margin)
     height, width = nearest_w.shape
@@ -129,16 +129,16 @@ def drop_run(
     span_raw: NDArray[np.uint16],
     mask: NDArray[np.uint8],
 ) -> None:
-    """One run of `drop_halo`; written for the vectoriser."""
+    """Process one run of `drop_halo`; written for the vectoriser."""
     for x in range(len(near_raw)):
         mask[x] &= np.uint16(depth_raw[x] - near_raw[x]) > span_raw[x]
 
 
 @kernel
 def drop_halo(depth_raw: NDArray[np.uint16], top: int, halo: Halo, mask: NDArray[np.uint8]) -> None:
-    """Take the pixels of `depth_raw` (H, W) that lie in their halo's band out of `mask` (H, at least W).
+    """Clear the pixels in `mask` (H, at least W) whose `depth_raw` (H, W) lies in the band of their halo.
 
-    Row 0 of both is row `top` of the picture.
+    Row 0 of both is row `top` of the image.
     """
     runs, near_raw, span_raw = Halo(*halo)
     for i in range(len(runs)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The surface at a distance from a mesh, by way of a grid of distances."""
+"""The surface at a distance from a mesh, computed on a grid of distances."""
 
 from __future__ import annotations
 
@@ -24,10 +24,9 @@ def sample_faces(
     first: int,
     samples_m: NDArray[np.float32],
 ) -> int:
-    """Cover triangles with points at most `spacing_m` apart; returns how many they are.
+    """Sample triangles with points at most `spacing_m` apart; return the number of all points.
 
-    Writes those from number `first` on to `samples_m` (S, 3) as far as it reaches; call it once with S = 0 to learn
-    the number.
+    Write the points from number `first` on to `samples_m` (S, 3), as many as fit. Call with S = 0 for the number only.
     """
     number = -first
     for f in range(len(faces)):
@@ -61,7 +60,7 @@ def spread_distance(
 ) -> None:
     """Lower each grid node's squared distance (nx, ny, nz) to that of the nearest sample within `reach` nodes.
 
-    Node (i, j, k) lies at `origin_m + spacing_m * (i, j, k)`. Nodes out of reach of all keep what they had.
+    Node (i, j, k) is at `origin_m + spacing_m * (i, j, k)`. Nodes beyond the reach of all samples keep their value.
     """
     nx, ny, nz = squared_m2.shape
     for s in range(len(samples_m)):
@@ -81,7 +80,7 @@ def spread_distance(
 
 @kernel
 def flood_outside(inside: NDArray[np.bool_], outside: NDArray[np.bool_], stack: NDArray[np.int64]) -> None:
-    """Mark in `outside` (nx, ny, nz) the nodes that a walk from node (0, 0, 0) reaches without entering `inside`.
+    """Mark in `outside` (nx, ny, nz) the nodes connected with node (0, 0, 0) without passing through `inside`.
 
     `stack` (nx*ny*nz,) is scratch.
     """
@@ -112,10 +111,10 @@ def surface_net(
     vertices: NDArray[np.float32],
     faces: NDArray[np.int32],
 ) -> tuple[int, int]:
-    """The zero surface of `field` (nx, ny, nz), negative inside, one vertex a cell (naive surface nets, Gibson 1998).
+    """Compute the zero surface of `field` (nx, ny, nz), negative inside (naive surface nets, Gibson 1998).
 
-    Writes vertices (V, 3) in nodes and faces (F, 3), their fronts to the outside, as far as the arrays reach; returns
-    V and F. `vertex_of_cell` (nx, ny, nz) is scratch. The outermost nodes must be positive.
+    Each cell has one vertex. Write vertices (V, 3), in nodes, and faces (F, 3), which face outwards, as many as fit the
+    arrays; return V and F. `vertex_of_cell` (nx, ny, nz) is scratch. The outermost nodes must be positive.
     """
     nx, ny, nz = field.shape
     vertex_of_cell[:] = -1
@@ -149,7 +148,7 @@ def surface_net(
             for k in range(1, nz - 1):
                 here = field[i, j, k] < 0.0
                 for axis in range(3):
-                    # The edge from this node along the axis is shared by four cells; b and c are the other two axes.
+                    # Four cells share the edge from this node along the axis; b and c are the other two axes.
                     there = field[i + (axis == 0), j + (axis == 1), k + (axis == 2)] < 0.0
                     if here == there:
                         continue

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Integers of 32 bits that stay so: numba widens them to 64, and half as many then fit the vector unit's registers."""
+"""Arithmetic in integers of 32 bits. numba widens them to 64, which halves the width of the vector unit."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ def _none_negative(_: Any, a: Any, b: Any, c: Any) -> tuple[Any, Callable[..., A
 
 
 add = cast(Callable[[np.int32, np.int32], np.int32], intrinsic(_add))
-"""The sum of two, modulo 2**32; for kernels."""
+"""Add two integers modulo 2**32; for kernels."""
 
 multiply = cast(Callable[[np.int32, np.int32], np.int32], intrinsic(_multiply))
-"""The product of two, modulo 2**32; for kernels."""
+"""Multiply two integers modulo 2**32; for kernels."""
 
 none_negative = cast(Callable[[np.int32, np.int32, np.int32], np.bool_], intrinsic(_none_negative))
-"""Whether none of three is negative; for kernels."""
+"""Return True if none of three integers is negative; for kernels."""

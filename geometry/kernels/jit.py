@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How kernels are compiled."""
+"""Compiler options of kernels."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def kernel(function: Function) -> Function:
-    """Compile a pure function on arrays: without the GIL, kept on disk, division as IEEE 754 has it.
+    """Compile a pure function on arrays: without the GIL, cached on disk, with division as in IEEE 754.
 
-    No `fastmath`: it makes `isnan` false.
+    Not with `fastmath`, which makes `isnan` return False.
     """
     return cast(Function, numba.njit(nogil=True, cache=True, error_model="numpy")(function))

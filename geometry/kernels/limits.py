@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Expected depth less margins, as raw depth that a measured pixel is compared with.
+"""Limits: expected depth less margins, as raw depth for the comparison with measured pixels.
 
-Limits are uint16 in the camera's own units, so that the filter compares without converting.
+Limits are uint16 in the camera's own units, so that the filter compares without a conversion.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ RAW_MAX = 65535
 """The largest raw depth."""
 
 ZERO, ONE, TOP = np.float32(0.0), np.float32(1.0), np.float32(RAW_MAX)
-"""In float32, for one float64 among them would halve what the vector unit does at once."""
+"""Constants in float32: one float64 among them would halve the width of the vector unit."""
 
 
 class Margins(NamedTuple):
-    """By how much a limit lies before what is expected.
+    """Margins between a limit and the expected depth.
 
-    Before a CAD surface `cad_base_m` and `cad_noise_per_m * z**2`, before a learned one `reference_base_m` and its
-    spread times `reference_gain`; at `range_max_m` where neither is known.
+    The margin of a CAD surface is `cad_base_m` and `cad_noise_per_m * z**2`; of a learned one `reference_base_m` and
+    its spread times `reference_gain`. If neither is known, the limit is `range_max_m`.
     """
 
     cad_base_m: float
@@ -38,10 +38,10 @@ class Margins(NamedTuple):
 
 
 class Band(NamedTuple):
-    """The raw depths of each pixel that belong to the robot: `near_raw` and `span_raw` (H, W), lower end and length.
+    """Raw depths of each pixel that belong to the robot: `near_raw` and `span_raw` (H, W), lower end and length.
 
-    So stored, the filter needs one unsigned compare. Where there is no robot the band is empty: its lower end is where
-    no limit reaches. `columns` (H, 2) holds of each row the first column and the one after the last that have a band.
+    In this form the filter needs one unsigned comparison. Without a robot the band is empty: its lower end is beyond
+    every limit. `columns` (H, 2) has for each row the first column with a band and the one after the last.
     """
 
     near_raw: NDArray[np.uint16]
@@ -51,10 +51,10 @@ class Band(NamedTuple):
 
 @kernel
 def less_noise(z_m: float, noise_m: float) -> float:
-    """Depth `z_m` less a noise that was reckoned there, taken off where it is symmetric: in disparity, that is in 1/z.
+    """Return depth `z_m` less its noise, subtracted in disparity, that is in 1/z, where it is symmetric.
 
-    For small noise it is `z - noise`. Far away that would fall below 0, for noise grows with the square of depth,
-    and a wall at the end of the hall would hide who stands before the camera.
+    For small noise this is `z - noise`. Far away that difference would fall below 0, since noise grows with the square
+    of depth, and a wall at the end of the hall would hide a person before the camera.
     """
     return z_m * z_m / (z_m + noise_m)
 
@@ -67,10 +67,10 @@ def static_limit_raw(
     margins: Margins,
     limit_raw: NDArray[np.uint16],
 ) -> None:
-    """Per pixel, the raw depth at which what is measured is no longer nearer than all that stands still.
+    """Compute for each pixel the raw depth below which a measurement is nearer than all static surfaces.
 
-    The nearer of the CAD surface, `cad_w` = 1/z (H, W), and the learned surface, `reference_m` and `spread_m` (H, W),
-    NaN where nothing was learned, each less its margin. Out: `limit_raw` (H, W), rounded down.
+    It is the nearer of the CAD surface, `cad_w` = 1/z (H, W), and the learned surface, `reference_m` and `spread_m`
+    (H, W), NaN if not learned, each less its margin. Out: `limit_raw` (H, W), rounded down.
     """
     cad_base_m, cad_noise_per_m, reference_base_m, reference_gain, range_max_m, depth_scale_m = Margins(*margins)
     height, width = limit_raw.shape
@@ -91,7 +91,7 @@ def static_limit_raw(
 def nearest_over(
     image: NDArray[np.uint16], radius_px: int, scratch: NDArray[np.uint16], out: NDArray[np.uint16]
 ) -> None:
-    """Minimum over the square of `radius_px` around each pixel, (H, W); `scratch` (H, W)."""
+    """Compute the minimum over the square of `radius_px` around each pixel (H, W); `scratch` is (H, W)."""
     height, width = image.shape
     for y in range(height):
         for x in range(width):
@@ -109,7 +109,7 @@ def nearest_over(
 
 @kernel
 def empty_row(near_raw: NDArray[np.uint16], span_raw: NDArray[np.uint16], first: int, end: int) -> None:
-    """No band from column `first` to before `end`."""
+    """Empty the band from column `first` to before `end`."""
     if first < end:
         near_raw[first:end] = np.uint16(RAW_MAX)
         span_raw[first:end] = np.uint16(0)
@@ -125,17 +125,17 @@ def band_of_row(
     near_raw: NDArray[np.uint16],
     span_raw: NDArray[np.uint16],
 ) -> None:
-    """One stretch of a row of `robot_band_raw`; written for the vectoriser: no branch, one type, nothing but arrays."""
+    """Process a part of a row of `robot_band_raw`; for the vectoriser: no branch, one type, only arrays."""
     for i in range(len(nearest_w)):
         nearest, farthest = nearest_w[i], farthest_w[i]
-        # A back without a front: the front lies before the near plane, and the camera in the padding.
+        # A back without a front: the front is before the near plane, and the camera is inside the padding.
         within = (nearest == NOTHING_NEAREST) & (farthest > NOTHING_FARTHEST)
         z_near = ZERO if within else ONE / nearest
         z_far = max(-ONE / farthest, z_near + depth_m)
         near = min(max((z_near - noise_per_m * z_near * z_near) * units_per_m, ZERO), TOP)
         far = min(max((z_far + noise_per_m * z_far * z_far) * units_per_m, ZERO), TOP)
         low = np.int32(near)
-        # Where nothing was drawn the above is nonsense.
+        # The values are meaningless for pixels where nothing was drawn.
         drawn = (nearest > NOTHING_NEAREST) | within
         near_raw[i] = np.uint16(low) if drawn else np.uint16(RAW_MAX)
         span_raw[i] = np.uint16(np.int32(far) - low) if drawn else np.uint16(0)
@@ -151,11 +151,11 @@ def robot_band_raw(
     depth_scale_m: float,
     band: Band,
 ) -> None:
-    """The band of raw depths in which a measurement belongs to the robot, as `rasterize.draw_meshes` has drawn it.
+    """Compute the band of raw depths in which a measurement belongs to the robot drawn by `rasterize.draw_meshes`.
 
-    From the nearest padded surface less its noise margin, or from 0 where the camera stands in the padding, to the
-    farthest one, or `depth_m` behind the nearest if that is farther, plus the margin there: what stands behind the
-    robot is still seen. `band` is renewed, and what was there before is made empty.
+    The band starts at the nearest padded surface less its noise margin, or at 0 if the camera is inside the padding. It
+    ends at the farthest surface, or `depth_m` behind the nearest if that is farther, plus the margin there. So objects
+    behind the robot are still seen. `band` is overwritten; its previous content is emptied.
     """
     buffer, band = Buffer(*buffer), Band(*band)
     window, nearest_w, farthest_w = buffer
@@ -186,7 +186,7 @@ def robot_band_raw(
 
 @kernel
 def clear_band(band: Band) -> None:
-    """Make the band of the robot empty everywhere."""
+    """Empty the band of the robot everywhere."""
     near_raw, span_raw, columns = Band(*band)
     for y in range(len(near_raw)):
         empty_row(near_raw[y], span_raw[y], columns[y, 0], columns[y, 1])
@@ -195,9 +195,9 @@ def clear_band(band: Band) -> None:
 
 @kernel
 def lower_row(nearest_w: NDArray[np.float32], depth_m: NDArray[np.float32]) -> None:
-    """One stretch of a row of `lower_depth`; written for the vectoriser."""
+    """Process a part of a row of `lower_depth`; written for the vectoriser."""
     for i in range(len(nearest_w)):
-        # Where nothing was drawn w is 0 and its inverse infinite.
+        # If nothing was drawn, w is 0 and its inverse infinite.
         depth_m[i] = min(depth_m[i], ONE / nearest_w[i])
 
 
@@ -205,7 +205,7 @@ def lower_row(nearest_w: NDArray[np.float32], depth_m: NDArray[np.float32]) -> N
 def lower_depth(
     buffer: Buffer, rectangles: NDArray[np.int32], links: NDArray[np.bool_], depth_m: NDArray[np.float32]
 ) -> None:
-    """Lower `depth_m` (H, W) to what `rasterize.draw_meshes` has drawn where that is nearer."""
+    """Lower `depth_m` (H, W) to the surfaces drawn by `rasterize.draw_meshes`, where they are nearer."""
     buffer = Buffer(*buffer)
     window = buffer.window
     for y in range(window[0], window[0] + window[2]):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How badly a frame fits what is known, from where the camera should be and from places close by."""
+"""Misfit of a frame to the known surfaces, for a camera at its assumed pose and at poses close by."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from geometry.kernels.jit import kernel
 from geometry.kernels.pinhole import Camera, deproject, in_32, moved, nearest_pixel, project, rows_of_32
 
 UNKNOWN_MISFIT = 0.5
-"""Of a pixel that falls where nothing is known: neither does it fit, nor does it not."""
+"""Cost of a point without a known surface: it neither agrees nor disagrees."""
 
 
 @kernel
@@ -25,11 +25,12 @@ def compared_points(
     points_raw: NDArray[np.float32],
     tallies: NDArray[np.int64],
 ) -> int:
-    """Every `stride_px`-th measured pixel that the robot may not cover, as a point in the camera frame.
+    """Collect every `stride_px`-th measured pixel that the robot cannot cover, as points in the camera frame.
 
-    `static_raw` (H, W) is the expected raw depth, 0 where nothing is known. Out: `points_raw` (3, N), of which as many
-    columns as are returned; `tallies` (4,) = pixels looked at, of these before a known surface, measured, and farther
-    away than the surface there by more than the tolerance, which a correct picture cannot show.
+    `static_raw` (H, W) is the expected raw depth, 0 if not known. Returns the number of points N; out: the first N
+    columns of `points_raw` (3, .), in raw units; `tallies` (4,), the counts of sampled pixels, of those with a known
+    surface, of measured ones, and of those farther than the surface by more than the tolerance, which is impossible for
+    a camera at its assumed pose.
     """
     camera, tolerance = Camera(*camera), Tolerance(*tolerance)
     tallies[:] = 0
@@ -63,11 +64,21 @@ def misfit_there(
     T_expected_there: NDArray[np.float64],
     scale: Tolerance,
 ) -> float:
-    """How badly points fit the static surfaces if the camera stood elsewhere, summed.
+    """Return the sum of the robust costs of points against the static surfaces, for a camera at another pose.
 
-    `T_expected_there` (4, 4), its translation in raw units, maps points of a camera that stands there into the frame
-    from which `static_raw` (H, W) was drawn. A residual `r` in scales counts `r**2 / (1 + r**2)`, so that what is
-    unknown and near counts 1 wherever the camera stands.
+    `T_expected_there` (4, 4), with its translation in raw units, maps points from the frame of the camera at that pose
+    into the frame for which `static_raw` (H, W) was rendered. `points_raw` (3, .) has `points` valid columns.
+
+    The residual of a point at depth `z` is `r = (z_there - expected) / s` with the scale
+    `s = scale.base_raw + scale.per_raw2 * z**2`, the noise of a depth camera: `z_there` is the depth of the point in
+    the expected frame, `expected` the surface at its pixel. Its cost is that of Geman and McClure,
+
+        rho(r) = r**2 / (1 + r**2),
+
+    which is quadratic for small residuals and bounded by 1. So points of an unknown obstacle, which fit at no pose,
+    cost about 1 each at every pose: they shift the sum by a constant, and the points on known surfaces
+    determine the minimum over poses. A point behind the camera, outside the image or without a known surface costs
+    `UNKNOWN_MISFIT`, the cost of `r = 1`, so that a pose that moves points out of view gains little.
     """
     rows = rows_of_32(T_expected_there)
     lens = in_32(Camera(*camera))

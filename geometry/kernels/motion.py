@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which links have moved since they were drawn, and which are therefore drawn again."""
+"""Detection of links that moved since they were drawn, and therefore must be drawn again."""
 
 from __future__ import annotations
 
@@ -11,19 +11,21 @@ from numpy.typing import NDArray
 from geometry.kernels.jit import kernel
 
 STILL, MOVED, KEPT_CHANGES = 0, 1, 2
-"""What `settle` finds: no link moved; some did; and it is other links than before that stand still."""
+"""Results of `settle`: no link moved; some links moved; the set of still links changed."""
 
 
 class Stillness(NamedTuple):
-    """A link stands still that moved by no more than `still_m`, and is kept when so for `kept_after` drawings."""
+    """Thresholds: a link that moved by at most `still_m` is still, and is kept after `kept_after` still drawings."""
 
     still_m: float
     kept_after: int
 
 
 class Drawn(NamedTuple):
-    """Of L links the `poses` (L, 4, 4) and the padding at which they were drawn, and for how many drawings each has
-    been still; whether it is kept, and whether it is drawn now.
+    """State of L drawn links.
+
+    `poses` (L, 4, 4) and `padding_m` (L,) at which they were drawn, `still_for` (L,) the number of drawings since each
+    moved, `is_kept` (L,) and `is_drawn` (L,) the links kept, and drawn now.
     """
 
     poses: NDArray[np.float64]
@@ -44,10 +46,10 @@ def settle(
 ) -> int:
     """Compare the `poses` (L, 4, 4) and the padding (L,) of links with those at which they were drawn.
 
-    A link moved when a vertex `reach_m` (L,) from its origin may have moved by more than `still_m`. When none did
-    nothing is changed, unless all must be drawn `anew`. Else `still_for` (L,) counts the drawings since each moved, and
-    once a kept link moves, or another has been still for `kept_after`, those that are so long still are the kept ones.
-    Out: `is_kept`, and `is_drawn` for the others (L,); pose and padding of what will be drawn now.
+    A link moved if a vertex at `reach_m` (L,) from its origin may have moved by more than `still_m`. If none moved,
+    nothing changes, unless all must be drawn `anew`. Otherwise `still_for` (L,) counts the drawings since each moved.
+    When a kept link moves, or another has been still for `kept_after` drawings, the kept links are chosen again.
+    Out: `is_kept`; `is_drawn` for the others (L,); pose and padding of the links that are drawn now.
     """
     still_m, kept_after = Stillness(*stillness)
     drawn_poses, drawn_padding_m, still_for, is_kept, is_drawn = Drawn(*drawn)
@@ -58,7 +60,7 @@ def settle(
             moved_m += abs(poses[m, i, 3] - drawn_poses[m, i, 3])
             for j in range(3):
                 moved_m += abs(poses[m, i, j] - drawn_poses[m, i, j]) * reach_m[m]
-        # Nowhere was it drawn when this is not a number.
+        # NaN: never drawn.
         is_drawn[m] = not moved_m <= still_m
         still_before = still_before and not is_drawn[m]
     if still_before and not anew:

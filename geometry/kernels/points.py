@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the image to the counter in one sweep: what follows on a row is done while the row is in the cache.
+"""From the image to the counter in one sweep: all steps of a row run while the row is in the cache.
 
-Thirty times a second each frame comes to a cold cache. Stage by stage, the mask would be written to memory and read
+Each frame arrives in a cold cache, thirty times a second. Stage by stage, the mask would be written to memory and read
 back, and the image read twice.
 """
 
@@ -17,7 +17,7 @@ from geometry.kernels.limits import Band
 from geometry.kernels.voxelize import Counter, Grid, Mask, count_points
 
 ROWS_AT_ONCE = 16
-"""Of all images together 150 kB at 1280 pixels: they fit the second cache of any board."""
+"""Rows processed at once: 150 kB of all images at a width of 1280 pixels fit the second-level cache of any board."""
 
 
 @kernel
@@ -31,9 +31,9 @@ def count_foreground(
     mask: Mask,
     counter: Counter,
 ) -> int:
-    """`foreground_mask`, `drop_halo` and `count_points` on a few rows at a time; returns how many voxels were touched.
+    """Run `foreground_mask`, `drop_halo` and `count_points` on a few rows at a time; return the voxels touched.
 
-    Arguments as theirs; `mask`, of ROWS_AT_ONCE rows, is scratch.
+    The arguments are theirs; `mask`, of ROWS_AT_ONCE rows, is scratch.
     """
     robot, halo, grid, mask, counter = Band(*robot), Halo(*halo), Grid(*grid), Mask(*mask), Counter(*counter)
     height = len(depth_raw)

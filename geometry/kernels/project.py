@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where meshes come to lie on the screen.
+"""Projection of meshes onto the screen.
 
-Conventions are those of `pinhole`. Corners are rounded to `1 / SUBPIXELS` of a pixel, so that what is drawn of them can
-be reckoned without rounding.
+Conventions are those of `pinhole`. Corners are rounded to `1 / SUBPIXELS` of a pixel, so that the rasterizer computes
+with them without rounding.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from geometry.kernels.jit import kernel
 from geometry.kernels.pinhole import moved, project, rows_of_32
 
 SUBPIXELS = np.float32(512.0)
-"""Corners are off by a thousandth of a pixel at most; a depth camera cannot tell half a pixel."""
+"""Rounding of corners: at most a thousandth of a pixel, while a depth camera cannot resolve half a pixel."""
 
 SUBPIXEL = np.float32(1.0 / 512.0)
 
 
 class Screen(NamedTuple):
-    """The camera that is drawn for, in float32: `fx`, `fy`, `cx`, `cy`, `width` and `height` in pixels."""
+    """The camera to render for, in float32: `fx`, `fy`, `cx`, `cy`, `width` and `height` in pixels."""
 
     fx: np.float32
     fy: np.float32
@@ -35,11 +35,11 @@ class Screen(NamedTuple):
 
 
 class Meshes(NamedTuple):
-    """M meshes one after the other.
+    """M meshes in flat arrays.
 
-    Mesh m has the vertices `vertex_starts[m]:vertex_starts[m + 1]` (M + 1,) of `vertices_m` (3, V) and likewise faces
+    Mesh m has the vertices `vertex_starts[m]:vertex_starts[m + 1]` (M + 1,) of `vertices_m` (3, V), and likewise faces
     of `faces` (3, F), whose indices count from the mesh's own first vertex. A vertex is placed at
-    `vertex + padding_m * offset`, with `offsets` (3, V). Of a `closed` (M,) one no back is ever seen.
+    `vertex + padding_m * offset`, with `offsets` (3, V). The back of a `closed` (M,) mesh is never seen.
     """
 
     vertices_m: NDArray[np.float32]
@@ -51,11 +51,11 @@ class Meshes(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory to draw meshes with.
+    """Memory for drawing meshes.
 
-    `placed` (6, V): pixel coordinates, inverse depth, and, of a mesh that the near plane cuts, coordinates in the
-    camera frame. `before` (M,): how many of a mesh's vertices lie before the near plane. `kinds` (most faces of a
-    mesh,) and `lists` (3, most faces + 1) of its triangles. `corners` (3, 3) and `polygon` (4, 3) of one that is cut.
+    `placed` (6, V): pixel coordinates, inverse depth, and, for a mesh cut by the near plane, coordinates in the camera
+    frame. `before` (M,): number of each mesh's vertices before the near plane. `kinds` (most faces of a mesh,) and
+    `lists` (3, most faces + 1) of its triangles. `corners` (3, 3) and `polygon` (4, 3) of a triangle that is cut.
     """
 
     placed: NDArray[np.float32]
@@ -67,7 +67,7 @@ class Scratch(NamedTuple):
 
 
 class Vertices(NamedTuple):
-    """Places or offsets of a mesh's vertices, each coordinate by itself."""
+    """Positions or offsets of a mesh's vertices, one array for each coordinate."""
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
@@ -75,7 +75,7 @@ class Vertices(NamedTuple):
 
 
 class Mesh(NamedTuple):
-    """One mesh as it was placed: its triangles by their corners' numbers, and its vertices, see `Scratch.placed`."""
+    """A placed mesh: the corner indices of its triangles, and its vertices (see `Scratch.placed`)."""
 
     a: NDArray[np.int32]
     b: NDArray[np.int32]
@@ -90,13 +90,13 @@ class Mesh(NamedTuple):
 
 @kernel
 def rounded(u_or_v: np.float32) -> np.float32:
-    """A pixel coordinate in whole subpixels."""
+    """Round a pixel coordinate to whole subpixels."""
     return np.float32(np.rint(u_or_v * SUBPIXELS) * SUBPIXEL)
 
 
 @kernel
 def mesh_of(m: int, meshes: Meshes, scratch: Scratch) -> Mesh:
-    """Mesh m, and where it is placed."""
+    """Return mesh m with its placed vertices."""
     a, b, c = meshes.faces[0], meshes.faces[1], meshes.faces[2]
     start, stop = meshes.face_starts[m], meshes.face_starts[m + 1]
     first, end = meshes.vertex_starts[m], meshes.vertex_starts[m + 1]
@@ -117,9 +117,9 @@ def place_vertices(
     screen: Screen,
     mesh: Mesh,
 ) -> int:
-    """Vertices to the screen, into `mesh`; returns how many lie before the near plane.
+    """Project vertices into `mesh`; return the number of vertices before the near plane.
 
-    Written for the vectoriser: one type, no branch, each coordinate in its own array.
+    Written for the vectoriser: one type, no branch, one array for each coordinate.
     """
     rows = rows_of_32(T_camera_mesh)
     x_m, y_m, z_m = vertices_m
@@ -144,7 +144,7 @@ def place_vertices(
 def bring_vertices(
     vertices_m: Vertices, offsets: Vertices, padding_m: np.float32, T_camera_mesh: NDArray[np.float64], mesh: Mesh
 ) -> None:
-    """Vertices to the camera frame, reckoned as `place_vertices` does: only a mesh that is cut needs them there."""
+    """Transform vertices into the camera frame, by the same arithmetic as `place_vertices`; only cut meshes need it."""
     rows = rows_of_32(T_camera_mesh)
     x_m, y_m, z_m = vertices_m
     offset_x, offset_y, offset_z = offsets
@@ -158,7 +158,7 @@ def bring_vertices(
 
 @kernel
 def bound(mesh: Mesh, screen: Screen, rectangle: NDArray[np.int32]) -> None:
-    """Set `rectangle` (4,) to the pixels within a mesh's bounds; in integers, which the vectoriser can."""
+    """Set `rectangle` (4,) to the pixels within a mesh's bounds; in integers, which can be vectorised."""
     u_px, v_px, width, height = mesh.u_px, mesh.v_px, screen.width, screen.height
     left, top = np.int32(width), np.int32(height)
     right, bottom = np.int32(-1), np.int32(-1)
@@ -176,9 +176,9 @@ def bound(mesh: Mesh, screen: Screen, rectangle: NDArray[np.int32]) -> None:
 
 @kernel
 def clip(screen: Screen, scratch: Scratch) -> int:
-    """Cut the triangle whose corners `scratch` has at the near plane; returns how many corners are left.
+    """Clip the triangle whose corners are in `scratch` at the near plane; return the number of corners left.
 
-    Out: its `polygon`, their pixel coordinates and inverse depth; a triangle cut by a plane has up to four.
+    Out: its `polygon`, pixel coordinates and inverse depth; a triangle cut by a plane has up to four corners.
     """
     corners, polygon, near_m = scratch.corners, scratch.polygon, screen.near_m
     count = 0
@@ -187,13 +187,13 @@ def clip(screen: Screen, scratch: Scratch) -> int:
         z_i = corners[i, 2]
         z_j = corners[j, 2]
         if z_i >= near_m:
-            # Reckoned as `place_vertices` does: a neighbour that is not cut has the same corners.
+            # Computed as in `place_vertices`: a neighbour that is not cut has the same corners.
             w = np.float32(1.0) / z_i
             u, v = project(corners[i, 0], corners[i, 1], w, screen)
             polygon[count, 0], polygon[count, 1], polygon[count, 2] = rounded(u), rounded(v), w
             count += 1
         if (z_i >= near_m) != (z_j >= near_m):
-            # Always from the end in front, so that a neighbour that is cut too finds the same point.
+            # Always from the end in front, so that a neighbour that is cut too computes the same point.
             front, back = (i, j) if z_i >= near_m else (j, i)
             share = (near_m - corners[front, 2]) / (corners[back, 2] - corners[front, 2])
             x = corners[front, 0] + share * (corners[back, 0] - corners[front, 0])
@@ -207,7 +207,7 @@ def clip(screen: Screen, scratch: Scratch) -> int:
 
 @kernel
 def take_corners(mesh: Mesh, f: int, corners: NDArray[np.float32]) -> None:
-    """The corners (3, 3) of triangle f in the camera frame."""
+    """Copy the corners (3, 3) of triangle f in the camera frame."""
     i, j, k = mesh.a[f], mesh.b[f], mesh.c[f]
     corners[0, 0], corners[0, 1], corners[0, 2] = mesh.x_m[i], mesh.y_m[i], mesh.z_m[i]
     corners[1, 0], corners[1, 1], corners[1, 2] = mesh.x_m[j], mesh.y_m[j], mesh.z_m[j]
@@ -216,7 +216,7 @@ def take_corners(mesh: Mesh, f: int, corners: NDArray[np.float32]) -> None:
 
 @kernel
 def bound_cut(mesh: Mesh, screen: Screen, scratch: Scratch, rectangle: NDArray[np.int32]) -> None:
-    """`bound` for a mesh that the near plane cuts: of what is left of its triangles."""
+    """Do the same as `bound` for a mesh cut by the near plane: bound the clipped triangles."""
     width, height, polygon = screen.width, screen.height, scratch.polygon
     left, top, right, bottom = 1e9, 1e9, -1.0, -1.0
     for f in range(len(mesh.a)):
@@ -240,10 +240,10 @@ def place_meshes(
     scratch: Scratch,
     rectangles: NDArray[np.int32],
 ) -> None:
-    """Bring the `chosen` (M,) of M meshes to the screen, each with its pose (M, 4, 4) and padding (M,).
+    """Project the `chosen` (M,) of M meshes onto the screen, each with its pose (M, 4, 4) and padding (M,).
 
-    Out: what `scratch` has of where they are placed; `rectangles` (M, 4), the pixels that a mesh may touch: first and
-    last row, first and last column, empty (first > last) where it is not in view.
+    Out: the placed vertices in `scratch`; `rectangles` (M, 4), the pixels that a mesh may touch: first and last row,
+    first and last column, empty (first > last) if it is not in view.
     """
     x_m, y_m, z_m = meshes.vertices_m[0], meshes.vertices_m[1], meshes.vertices_m[2]
     offset_x, offset_y, offset_z = meshes.offsets[0], meshes.offsets[1], meshes.offsets[2]
@@ -253,7 +253,7 @@ def place_meshes(
         first, end = meshes.vertex_starts[m], meshes.vertex_starts[m + 1]
         vertices_m = Vertices(x_m[first:end], y_m[first:end], z_m[first:end])
         offsets = Vertices(offset_x[first:end], offset_y[first:end], offset_z[first:end])
-        # Where nothing is added, nothing need be fetched from memory: any numbers that are there will do.
+        # With a padding of 0 the offsets do not matter: use any array that is already in the cache.
         added = offsets if padding_m[m] != 0.0 else vertices_m
         mesh = mesh_of(m, meshes, scratch)
         scratch.before[m] = place_vertices(vertices_m, added, padding_m[m], T_camera_mesh[m], screen, mesh)

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Meshes onto the screen: a z-buffer of inverse depth (the paper's Algorithms 2 to 4).
+"""Rasterize meshes: a z-buffer of inverse depth (the paper's Algorithms 2 to 4).
 
-What is linear on the screen is 1/z, not z; so the buffers hold `w = 1/z` (1/m): the nearest surface has the largest w,
-and 0 means that nothing stands there. The farthest surface is kept as `-w`, so that of either the largest counts.
-A closed mesh shows its nearest surface by the faces that are turned here, and its farthest by those turned away: each
-of its triangles is drawn into one buffer only.
+On the screen 1/z is linear, not z. So the buffers hold `w = 1/z` (1/m): the nearest surface has the largest w, and 0
+means that there is no surface. The farthest surface is stored as `-w`, so that the largest value wins in both buffers.
+The nearest surface of a closed mesh consists of its front faces, and the farthest of its back faces: each triangle is
+drawn into one buffer only.
 
-A buffer holds only a *window* of the picture, the rectangle about all that is drawn: thirty times a second it comes
-from cold memory, where few pages in a row are fetched several times as fast as many scattered ones.
+A buffer holds only a *window* of the image, the rectangle around everything drawn. Thirty times a second it comes from
+cold memory, where few contiguous pages are several times faster than many scattered ones.
 
 Small triangles, which are nearly all, are drawn by edge functions in integers, which never round, `LANES` pixels of a
-row at once. Large ones go span by span in float64.
+row at once. Large ones are drawn span by span in float64.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ NOTHING_NEAREST = np.float32(0.0)
 """`nearest_w` of a pixel without a surface: infinitely far."""
 
 NOTHING_FARTHEST = np.float32(-1e6)
-"""`farthest_w` of a pixel without a surface: a micrometre away, so that any surface is farther. Not the least
-float32: its inverse is subnormal, which costs a hundred cycles a pixel."""
+"""`farthest_w` of a pixel without a surface: a micrometre away, so that any surface is farther. It is not the smallest
+float32, whose inverse is subnormal and costs a hundred cycles a pixel."""
 
 LANES = 16
-"""Pixels of a row that are drawn at once, whether they are needed or not; buffers are so much wider than the picture.
-With fewer the compiler unrolls the loop before it could vectorise it."""
+"""Pixels of a row drawn at once, needed or not; buffers are wider than the image by this. With fewer, the compiler
+unrolls the loop before it can vectorise it."""
 
 SMALL_ROWS = 96
-"""Triangles up to twice `LANES` wide and so many rows high are drawn with integers of 32 bits. An edge's function is
+"""Triangles up to twice `LANES` wide and this many rows high are drawn with integers of 32 bits. An edge function is
 the difference of two products, at most (32 + 16) * 96 + 32 * 96 pixels in units of 1/512 squared: 2.01e9 of 2.15e9."""
 
 UNSEEN, SMALL, LARGE = 0, 1, 2
-"""What is done with a triangle: nothing, for it is not wanted or holds no pixel centre; or how it is drawn: by integers
-when no wider than twice `LANES` and no higher than `SMALL_ROWS`, else span by span."""
+"""Kinds of triangles: not drawn, since it faces away or contains no pixel centre; drawn by integers, if at most twice
+`LANES` wide and `SMALL_ROWS` high; else drawn span by span."""
 
 AWAY = 4
-"""Added to it when the triangle is turned away."""
+"""Added to the kind of a back face."""
 
 
 class Buffer(NamedTuple):
-    """What is drawn into, 1/m.
+    """Buffers to draw into, 1/m.
 
-    `window` (4,): first row, first column, rows, and columns with those that `LANES` may run over. `nearest_w` and
-    `farthest_w` are flat, with room for H * (W + LANES) + LANES pixels. `farthest_w` may be empty: then none is drawn.
+    `window` (4,): first row, first column, rows, and columns including those that `LANES` may overrun. `nearest_w` and
+    `farthest_w` are flat, with room for H * (W + LANES) + LANES pixels. An empty `farthest_w` is not drawn.
     """
 
     window: NDArray[np.int64]
@@ -61,9 +61,9 @@ class Buffer(NamedTuple):
 
 
 class Side(NamedTuple):
-    """The nearest or the farthest surface: which triangles show it, turned here or away, and where it is kept.
+    """The nearest or the farthest surface: the faces that show it, front or back, and its buffer.
 
-    The largest of `sign * w` counts; `sign` is 1 for the nearest.
+    The largest of `sign * w` wins; `sign` is 1 for the nearest.
     """
 
     with_here: bool
@@ -74,7 +74,7 @@ class Side(NamedTuple):
 
 
 class Corner(NamedTuple):
-    """Of a triangle: its pixel coordinates and w."""
+    """A corner of a triangle: pixel coordinates and w."""
 
     u: float
     v: float
@@ -83,9 +83,9 @@ class Corner(NamedTuple):
 
 @kernel
 def sort_faces(mesh: Mesh, with_away: bool, screen: Screen, kinds: NDArray[np.uint8]) -> None:
-    """What is to be done with each triangle, all of whose corners lie beyond the near plane.
+    """Classify each triangle of a mesh whose corners are all beyond the near plane.
 
-    Written for the vectoriser: no branch. Faces turned away are left out unless they are wanted (Algorithm 3).
+    Written for the vectoriser: no branch. Back faces are left out unless required (Algorithm 3).
     """
     a, b, c, u_px, v_px = mesh.a, mesh.b, mesh.c, mesh.u_px, mesh.v_px
     last_column, last_row = np.float32(screen.width - 1), np.float32(screen.height - 1)
@@ -102,15 +102,15 @@ def sort_faces(mesh: Mesh, with_away: bool, screen: Screen, kinds: NDArray[np.ui
         away = with_away & (double_area > 0.0)
         seen = holds_column & holds_row & ((double_area < 0.0) | away)
         large = (bottom - top > height) | (right - left > width)
-        # UNSEEN and one more for each step; a choice between constants would not be vectorised.
+        # UNSEEN plus one for each condition; a choice between constants would not be vectorised.
         kinds[f] = np.uint8(seen) + np.uint8(seen & large) + np.uint8(AWAY) * np.uint8(seen & away)
 
 
 @kernel
 def sort_cut_faces(mesh: Mesh, near_m: np.float32, kinds: NDArray[np.uint8]) -> None:
-    """Mend `kinds` where a corner lies before the near plane: such a triangle is cut, or not seen at all.
+    """Correct `kinds` of triangles with a corner before the near plane: such a triangle is cut, or not visible.
 
-    Where it is turned is told when it is cut.
+    Clipping determines the direction that it faces.
     """
     z_m = mesh.z_m
     for f in range(len(mesh.a)):
@@ -126,11 +126,11 @@ def sort_cut_faces(mesh: Mesh, near_m: np.float32, kinds: NDArray[np.uint8]) -> 
 def list_faces(
     kinds: NDArray[np.uint8], here: NDArray[np.int32], away: NDArray[np.int32], large: NDArray[np.int32]
 ) -> tuple[int, int, int]:
-    """The numbers of the small triangles turned here, of those turned away, and of the large; how many of each."""
-    # Unsigned, for a signed index is tested for counting from the end.
+    """List the indices of the small front faces, the small back faces and the large triangles; return their numbers."""
+    # Unsigned, since numba tests a signed index for counting from the end.
     heres, aways, larges = np.uint64(0), np.uint64(0), np.uint64(0)
     for f in range(len(kinds)):
-        # Written always and kept when it is one: a branch would be guessed wrong too often.
+        # Always written, and counted only if it belongs here: a branch would be mispredicted too often.
         here[heres] = f
         away[aways] = f
         large[larges] = f
@@ -144,10 +144,10 @@ def list_faces(
 
 @kernel
 def fill_small(faces: NDArray[np.int32], mesh: Mesh, screen: Screen, side: Side) -> None:
-    """Draw the small triangles whose numbers are `faces`.
+    """Draw the small triangles with the indices `faces`.
 
-    A pixel is drawn when its centre is on the inner side of all three edges, or on one: neighbours leave no gap, for
-    integers do not round.
+    A pixel is drawn if its centre is inside all three edges or on one. Neighbours leave no gap, since integers do not
+    round.
     """
     a, b, c = mesh.a, mesh.b, mesh.c
     u_px, v_px, w_per_m = mesh.u_px, mesh.v_px, mesh.w_per_m
@@ -167,13 +167,13 @@ def fill_small(faces: NDArray[np.int32], mesh: Mesh, screen: Screen, side: Side)
         left, top = np.int32(u_left), np.int32(v_top)
         right = np.int32(min(max(u0, max(u1, u2)), last_column))
         bottom = np.int32(min(max(v0, max(v1, v2)), last_row))
-        # From here on in subpixels from the first pixel.
+        # From here on in subpixels relative to the first pixel.
         x0, y0 = np.int32((u0 - u_left) * SUBPIXELS), np.int32((v0 - v_top) * SUBPIXELS)
         x1, y1 = np.int32((u1 - u_left) * SUBPIXELS), np.int32((v1 - v_top) * SUBPIXELS)
         x2, y2 = np.int32((u2 - u_left) * SUBPIXELS), np.int32((v2 - v_top) * SUBPIXELS)
         double_area = np.int32((x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0))
         turn = np.int32(1) if double_area > 0 else np.int32(-1)
-        # Each edge's function, positive inside: its change by a subpixel to the right and down, and its start.
+        # Each edge function, positive inside: its change by a subpixel to the right and down, and its start.
         per_x_0, per_y_0 = np.int32((y0 - y1) * turn), np.int32((x1 - x0) * turn)
         per_x_1, per_y_1 = np.int32((y1 - y2) * turn), np.int32((x2 - x1) * turn)
         per_x_2, per_y_2 = np.int32((y2 - y0) * turn), np.int32((x0 - x2) * turn)
@@ -185,7 +185,7 @@ def fill_small(faces: NDArray[np.int32], mesh: Mesh, screen: Screen, side: Side)
         per_area = SUBPIXELS * SUBPIXELS / np.float32(double_area)
         w_per_u = ((w1 - w0) * (v2 - v0) - (w2 - w0) * (v1 - v0)) * per_area
         w_per_v = ((w2 - w0) * (u1 - u0) - (w1 - w0) * (u2 - u0)) * per_area
-        # A sliver's gradient is ill-conditioned: never leave the range of its corners.
+        # The gradient of a sliver is ill-conditioned: never leave the range of its corners.
         w_low, w_high = min(w0, min(w1, w2)), max(w0, max(w1, w2))
         w = w0 + (u_left - u0) * w_per_u + (v_top - v0) * w_per_v
         at = np.uint64((top - first_row) * stride + left - first_column)
@@ -214,10 +214,10 @@ def fill_small(faces: NDArray[np.int32], mesh: Mesh, screen: Screen, side: Side)
 
 @kernel
 def fill_triangle(one: Corner, two: Corner, three: Corner, screen: Screen, side: Side) -> None:
-    """Draw one triangle of any size: the largest w.
+    """Draw one triangle of any size; the largest w wins.
 
-    Every pixel centre on or inside an edge is drawn, and the crossing of an edge with a row is reckoned from its
-    upper end whichever triangle it belongs to: neighbours leave no gap.
+    Every pixel centre on or inside an edge is drawn. The crossing of an edge with a row is computed from the edge's
+    upper end for both triangles that share it, so neighbours leave no gap.
     """
     u0, v0, w0 = one
     u1, v1, w1 = two
@@ -251,7 +251,7 @@ def fill_triangle(one: Corner, two: Corner, three: Corner, screen: Screen, side:
         last = min(math.floor(max(u_long, u_short)), right)
         if first > last:
             continue
-        # A sliver's gradient is ill-conditioned: never leave the range of its corners.
+        # The gradient of a sliver is ill-conditioned: never leave the range of its corners.
         w_row = w0 + (y - v0) * w_per_v
         w = min(max(np.float32(w_row + (first - u0) * w_per_u), w_low), w_high)
         w_last = min(max(np.float32(w_row + (last - u0) * w_per_u), w_low), w_high)
@@ -265,7 +265,7 @@ def fill_triangle(one: Corner, two: Corner, three: Corner, screen: Screen, side:
 
 @kernel
 def fill_clipped(screen: Screen, side: Side, scratch: Scratch) -> None:
-    """Draw what lies beyond the near plane of the triangle whose corners `scratch` has."""
+    """Draw the part beyond the near plane of the triangle whose corners are in `scratch`."""
     sign, polygon = side.sign, scratch.polygon
     for i in range(1, clip(screen, scratch) - 1):
         u0, v0 = polygon[0, 0], polygon[0, 1]
@@ -279,7 +279,7 @@ def fill_clipped(screen: Screen, side: Side, scratch: Scratch) -> None:
 
 @kernel
 def corner_of(mesh: Mesh, i: int, sign: np.float32) -> Corner:
-    """Vertex i, in float64 as after clipping, so that neighbours agree on where their edge crosses a row."""
+    """Return vertex i in float64 as after clipping, so that neighbours agree where their edge crosses a row."""
     return Corner(np.float64(mesh.u_px[i]), np.float64(mesh.v_px[i]), np.float64(sign * mesh.w_per_m[i]))
 
 
@@ -287,9 +287,9 @@ def corner_of(mesh: Mesh, i: int, sign: np.float32) -> Corner:
 def fill_large(
     faces: NDArray[np.int32], mesh: Mesh, is_cut: bool, screen: Screen, side: Side, scratch: Scratch
 ) -> None:
-    """Draw those of the large triangles whose numbers are `faces` that are turned as wanted.
+    """Draw those large triangles with the indices `faces` that face the required direction.
 
-    `is_cut` when vertices of their mesh lie before the near plane.
+    `is_cut` is True if vertices of their mesh are before the near plane.
     """
     near_m, z_m, sign = screen.near_m, mesh.z_m, side.sign
     for n in range(len(faces)):
@@ -305,7 +305,7 @@ def fill_large(
 
 @kernel
 def fill_mesh(mesh: Mesh, closed: bool, is_cut: bool, screen: Screen, buffer: Buffer, scratch: Scratch) -> None:
-    """Draw one of the meshes of `draw_meshes`; `is_cut` when vertices of it lie before the near plane."""
+    """Draw one of the meshes of `draw_meshes`; `is_cut` is True if some of its vertices are before the near plane."""
     with_farthest = len(buffer.farthest_w) > 0
     kinds, lists = scratch.kinds[: len(mesh.a)], scratch.lists
     sort_faces(mesh, not closed or with_farthest, screen, kinds)
@@ -333,9 +333,9 @@ def fill_mesh(mesh: Mesh, closed: bool, is_cut: bool, screen: Screen, buffer: Bu
 def span_of_row(
     y: int, rectangles: NDArray[np.int32], chosen: NDArray[np.bool_], others: NDArray[np.bool_]
 ) -> tuple[int, int]:
-    """First column and the one after the last of `rectangles` (M, 4) in row y, of the `chosen` and the `others` (M,).
+    """Return the columns of row y covered by `rectangles` (M, 4) of the `chosen` and the `others` (M,).
 
-    (0, 0) when there is none.
+    The result is the first column and the one after the last, or (0, 0) for none.
     """
     first, end = 0, 0
     for m in range(len(rectangles)):
@@ -349,7 +349,7 @@ def span_of_row(
 def open_window(
     rectangles: NDArray[np.int32], chosen: NDArray[np.bool_], others: NDArray[np.bool_], buffer: Buffer
 ) -> None:
-    """Lay the window about the `rectangles` (M, 4) of the `chosen` and the `others` (M,); clear what they reach."""
+    """Set the window around the `rectangles` (M, 4) of the `chosen` and the `others` (M,), and clear their pixels."""
     window, nearest_w, farthest_w = buffer
     first_row, last_row, first_column, last_column = 2**30, -1, 2**30, -1
     for m in range(len(rectangles)):
@@ -371,7 +371,7 @@ def open_window(
 
 @kernel
 def copy_window(rectangles: NDArray[np.int32], chosen: NDArray[np.bool_], kept: Buffer, buffer: Buffer) -> None:
-    """Copy what the `chosen` (M,) of the `rectangles` (M, 4) reach into a `buffer` whose window encloses the other."""
+    """Copy the pixels of the `chosen` (M,) `rectangles` (M, 4) into a `buffer` whose window encloses the source's."""
     window = buffer.window
     for y in range(kept.window[0], kept.window[0] + kept.window[2]):
         first, end = span_of_row(y, rectangles, chosen, chosen)
@@ -395,12 +395,12 @@ def draw_meshes(
     rectangles: NDArray[np.int32],
     scratch: Scratch,
 ) -> None:
-    """Draw the `chosen` (M,) of M meshes over what is `kept` of the `others`, into nearest and farthest inverse depth.
+    """Draw the `chosen` (M,) of M meshes over the `kept` drawing of the `others`: nearest and farthest 1/z.
 
-    Poses (M, 4, 4), padding and `rectangles` as in `project.place_meshes`. Of a closed mesh, only faces turned here
-    (Algorithm 3) are drawn into `nearest_w`, and only those turned away into `farthest_w`. The `buffer` holds, where a
-    rectangle reaches, a window of the picture, which is laid anew. Where the near plane cuts away the front of a closed
-    mesh, there may be a farthest surface without a nearest.
+    Poses (M, 4, 4), padding and `rectangles` as in `project.place_meshes`. Of a closed mesh, only front faces are drawn
+    into `nearest_w` (Algorithm 3), and only back faces into `farthest_w`. The window of `buffer` is set anew to cover
+    all rectangles. If the near plane cuts away the front of a closed mesh, a pixel may have a farthest surface without
+    a nearest.
     """
     meshes, screen, scratch = Meshes(*meshes), Screen(*screen), Scratch(*scratch)
     kept, buffer = Buffer(*kept), Buffer(*buffer)

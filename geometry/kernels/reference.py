@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Surfaces that the empty cell shows, learned pixel by pixel.
+"""Background model of the empty cell, learned pixel by pixel.
 
-Each pixel keeps a few *modes*: depths that came again and again, with their mean and spread. A flickering edge has
-two; a person who walks past makes one that stays rare. What counts in the end is the nearest mode that is not rare
-among all the looks that the pixel had, measured or not: where the empty cell shows nothing, who walks past is the
-only one that is ever measured, and still rare.
+Each pixel keeps a few *modes*: depths that occurred repeatedly, with their mean and spread. A flickering edge has two.
+A person who walks past causes one that stays rare. The result is the nearest mode that is not rare among all frames in
+which the pixel was observed, measured or not. Unmeasured frames count too: where the empty cell gives no measurement, a
+passing person is the only thing ever measured, and is still rare.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from geometry.kernels.jit import kernel
 from geometry.kernels.limits import RAW_MAX
 
 TAIL_SIGMAS = 4.0
-"""Margins are some four spreads."""
+"""Standard deviations at which `students_excess` holds; margins are about four spreads."""
 
 MODES = 4
-"""A pixel at an edge shows two surfaces and the flying depths between; one more for who walks past."""
+"""Modes of a pixel: two surfaces at an edge, the flying depths between them, and one for a passing person."""
 
 
 class Modes(NamedTuple):
-    """What is known of each pixel: its `looks` (H, W), and of its modes how often each came, mean and sum of squares.
+    """Learned state of each pixel: the number of `looks` (H, W), and for each mode its count, mean and sum of squares.
 
     `numbers`, `means_m`, `squares_m2` are (H, W, MODES).
     """
@@ -38,7 +38,7 @@ class Modes(NamedTuple):
 
 
 class Matching(NamedTuple):
-    """Depths up to `range_max_m` count; those within `base_m + noise_per_m * z**2` of one another are one surface."""
+    """Matching of depths up to `range_max_m`: those within `base_m + noise_per_m * z**2` are one surface."""
 
     depth_scale_m: float
     range_max_m: float
@@ -47,9 +47,9 @@ class Matching(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """A mode counts that holds `share_min` of the looks.
+    """Rules for the result: a mode is valid if it has at least `share_min` of the looks.
 
-    Its spread is drawn towards `noise_per_m * z**2` as if `weight` frames had shown that.
+    Its spread is drawn towards `noise_per_m * z**2` with the weight of `weight` frames.
     """
 
     share_min: float
@@ -67,9 +67,9 @@ def observe(
 ) -> None:
     """Add one frame to the modes of every pixel (Welford's running mean and sum of squares).
 
-    What lies inside the robot's band, or is unmeasured where the robot stands, is no look at what is behind it.
-    Depths that are absent or beyond the range are a look that showed nothing. Any other depth joins the mode that it
-    matches, or starts one, in the place of the rarest when all are taken.
+    A pixel inside the robot's band, or unmeasured where the robot is, does not count as a look at the background.
+    A depth that is absent or beyond the range is a look without a result. Any other depth joins the mode that it
+    matches, or starts one; if all are in use, it replaces the rarest.
     """
     depth_scale_m, range_max_m, match_base_m, match_noise_per_m = Matching(*matching)
     looks, numbers, means_m, squares_m2 = Modes(*modes)
@@ -107,7 +107,7 @@ def observe(
 
 @kernel
 def students_excess(freedom: float) -> float:
-    """By how much few samples widen a spread that is multiplied by some four: Student's quantile over the normal one.
+    """Return the factor by which few samples widen a spread of about four deviations: Student's quantile over normal.
 
     Two terms of Fisher's expansion, at four standard deviations.
     """
@@ -118,11 +118,10 @@ def students_excess(freedom: float) -> float:
 
 @kernel
 def conclude(modes: Modes, prior: Prior, reference_m: NDArray[np.float32], spread_m: NDArray[np.float32]) -> None:
-    """The nearest mode that is not rare among a pixel's looks, and its standard deviation.
+    """Select the nearest mode that is not rare among a pixel's looks, and its standard deviation.
 
-    The spread is drawn towards the camera's model, for that of few frames is no measure, and widened as Student's t has
-    it. `reference_m`, `spread_m` (H, W) are NaN
-    where nothing was learned.
+    The spread is drawn towards the camera's model, since the spread of few frames is unreliable, and widened according
+    to Student's t. `reference_m`, `spread_m` (H, W) are NaN for pixels without a result.
     """
     looks, numbers, means_m, squares_m2 = Modes(*modes)
     share_min, prior_weight, prior_noise_per_m = Prior(*prior)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which blocks of the cell a frame looks through.
+"""Blocks of the cell that a frame looks through.
 
-A block is seen when enough of the rays through it are measured at or beyond its far side, and when its far side
-is nearer than everything that could hide an obstacle: the static limit and the robot's band.
+A block is seen if enough of the rays through it are measured at or beyond its far side, and if its far side is nearer
+than everything that could hide an obstacle: the static limit and the robot's band.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from geometry.kernels.jit import kernel
 from geometry.kernels.pinhole import Camera, moved, project, rows_of
 
 RAYS_PER_SIDE = 6
-"""A block is probed by a grid of about 6 x 6 of its pixels: 5 % of them decide nothing, and it costs little."""
+"""Probes along each side of a block: about 6 x 6 of its pixels, so that 5 % of them decide nothing, at little cost."""
 
 
 BLOCKED_MAX = 1
-"""Rays that may end before a block's far side: one is noise, more may be a finger that is too thin to be reported."""
+"""Limit of rays that may end before a block's far side: one is noise, more may be a finger too thin to be reported."""
 
 
 class Blocks(NamedTuple):
@@ -33,7 +33,7 @@ class Blocks(NamedTuple):
 
 
 class Measuring(NamedTuple):
-    """What a depth camera measures: from `near_m` on, with a noise of `noise_per_m * z**2`, in `depth_scale_m`."""
+    """Properties of a depth camera: least range `near_m`, noise `noise_per_m * z**2`, and `depth_scale_m`."""
 
     near_m: float
     noise_per_m: float
@@ -41,10 +41,10 @@ class Measuring(NamedTuple):
 
 
 class Views(NamedTuple):
-    """Of each block that lies wholly in the picture its number in `blocks`, and in `views` (., 5) what it covers.
+    """For each block entirely in the image, its number in `blocks`, and its extent in `views` (., 5).
 
-    That is first and last row, first and last column, and the raw depth of its far corner plus the noise there: what
-    stands just inside may be measured that much behind.
+    The extent is first and last row, first and last column, and the raw depth of the far corner plus the noise there:
+    an object just inside may be measured that much farther.
     """
 
     blocks: NDArray[np.int32]
@@ -52,7 +52,7 @@ class Views(NamedTuple):
 
 
 class Rectangle(NamedTuple):
-    """Of the rows that are looked at, and of the columns."""
+    """Rows and columns of the probes."""
 
     first_row: int
     last_row: int
@@ -61,7 +61,7 @@ class Rectangle(NamedTuple):
 
 
 class Looking(NamedTuple):
-    """Every `rows_apart`-th row is looked at; `reach_raw` (H / rows_apart, rounded up, W) is scratch."""
+    """Sampling: every `rows_apart`-th row is probed; `reach_raw` (H / rows_apart, rounded up, W) is scratch."""
 
     rows_apart: int
     reach_raw: NDArray[np.uint16]
@@ -71,7 +71,7 @@ class Looking(NamedTuple):
 def block_views(
     grid: Blocks, T_camera_world: NDArray[np.float64], camera: Camera, measuring: Measuring, views: Views
 ) -> int:
-    """List the blocks that lie wholly in the picture in `views`; returns how many."""
+    """List the blocks that are entirely in the image in `views`; return their number."""
     grid, camera, measuring, views = Blocks(*grid), Camera(*camera), Measuring(*measuring), Views(*views)
     shape, block_size_m, origin_m = grid
     near_m, noise_per_m, depth_scale_m = measuring
@@ -117,16 +117,16 @@ def reach_of_row(
     robot_near_raw: NDArray[np.uint16],
     reach_raw: NDArray[np.uint16],
 ) -> None:
-    """How far each ray of a row is sure to pass; written for the vectoriser."""
+    """Compute the depth up to which each ray of a row certainly passes; written for the vectoriser."""
     for x in range(len(reach_raw)):
         reach_raw[x] = min(depth_raw[x], min(static_limit_raw[x], robot_near_raw[x]))
 
 
 @kernel
 def passes(reach_raw: NDArray[np.uint16], rectangle: Rectangle, far_raw: int, share_min: float) -> bool:
-    """Whether at least `share_min` of the rays that are probed inside a rectangle reach `far_raw`.
+    """Return True if at least `share_min` of the probed rays inside a rectangle reach `far_raw`.
 
-    Of the others any may be unmeasured, but at most `BLOCKED_MAX` may end before it: a thin thing blocks few.
+    Any of the others may be unmeasured, but at most `BLOCKED_MAX` may end before it: a thin object blocks few rays.
     """
     first_row, last_row, first_column, last_column = rectangle
     row_step = max((last_row - first_row) // RAYS_PER_SIDE, 1)
@@ -143,10 +143,10 @@ def passes(reach_raw: NDArray[np.uint16], rectangle: Rectangle, far_raw: int, sh
         x = np.uint64(first_column)
         for _ in range(columns):
             possible -= int(row[x] < far)
-            # Between 1 and far, by one unsigned compare.
+            # Between 1 and far, by one unsigned comparison.
             blocked += int(np.uint16(row[x] - np.uint16(1)) < np.uint16(far - np.uint16(1)))
             x += column_step
-        # Most blocks are seen wholly or not at all.
+        # Most blocks are seen entirely or not at all.
         if possible < needed or blocked > BLOCKED_MAX:
             return False
     return True
@@ -163,9 +163,9 @@ def seen_blocks(
     looking: Looking,
     seen: NDArray[np.uint8],
 ) -> None:
-    """Set `seen` (all blocks,) to 1 for the blocks through which at least `share_min` of the probed rays pass, else 0.
+    """Set `seen` (all blocks,) to 1 for blocks through which at least `share_min` of the probed rays pass, else to 0.
 
-    Images are (H, W); `views` are those of `block_views`, of which `number` count.
+    Images are (H, W); the first `number` entries of `views`, from `block_views`, are valid.
     """
     rows_apart, reach_raw = Looking(*looking)
     blocks, rectangles = Views(*views)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Foreground pixels counted on the lattice (the paper's Algorithm 1, with its rounding mended).
+"""Foreground pixels counted on the lattice (the paper's Algorithm 1, with correct rounding).
 
-The counter is dense and has a rim of one empty voxel all around, so that whoever looks at a voxel's neighbours needs
-no test for the lattice's end. A *slot* is a place in it: that of voxel (ix, iy, iz) of a lattice (nx, ny, nz) is
-`((ix + 1) * (ny + 2) + iy + 1) * (nz + 2) + iz + 1`. One more slot behind the last takes what lies outside.
+The counter is dense and has a rim of one empty voxel all around, so that access to a voxel's neighbours needs no test
+for the end of the lattice. A *slot* is an index into it: that of voxel (ix, iy, iz) of a lattice (nx, ny, nz) is
+`((ix + 1) * (ny + 2) + iy + 1) * (nz + 2) + iz + 1`. One more slot after the last takes points outside.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from geometry.kernels.jit import kernel
 
 PIXELS_PER_WORD = 8
-"""A row of the mask is read as words of 64 bits: eight empty pixels are skipped at once."""
+"""Pixels in a word: a row of the mask is read in words of 64 bits, so that eight empty pixels are skipped at once."""
 
 
 class Grid(NamedTuple):
-    """The lattice before one camera, in units of voxels, with the camera's pose folded in.
+    """The lattice in the frame of one camera, in units of voxels, with the camera's pose included.
 
-    A pixel at column u, row v and raw depth d lies at `(column_rays[:, u] + row_rays[v]) * d + origin`;
+    A pixel at column u, row v and raw depth d is at `(column_rays[:, u] + row_rays[v]) * d + origin`;
     `column_rays` (3, W), `row_rays` (H, 3), `origin` (3,). `shape` (3,) is the lattice's.
     """
 
@@ -33,7 +33,7 @@ class Grid(NamedTuple):
 
 
 class Mask(NamedTuple):
-    """The pixels that are marked: rows of `pixels` (., stride), and the same memory as `words` (., stride / 8)."""
+    """The marked pixels: rows of `pixels` (., stride), and the same memory as `words` (., stride / 8)."""
 
     words: NDArray[np.uint64]
     pixels: NDArray[np.uint8]
@@ -42,8 +42,8 @@ class Mask(NamedTuple):
 class Counter(NamedTuple):
     """`counts` of `(nx + 2) * (ny + 2) * (nz + 2) + 1` slots, zero before the first call.
 
-    Slots that become non-zero are listed in `touched`, which is one longer than the most that may be; by it `forget`
-    makes them zero again. `slots` (W,) is scratch.
+    Slots that become non-zero are listed in `touched`, which is one longer than the largest number of them; `forget`
+    resets them by this list. `slots` (W,) is scratch.
     """
 
     counts: NDArray[np.uint32]
@@ -52,7 +52,7 @@ class Counter(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """The column's part of the rays of a stretch of a row."""
+    """The columns' part of the rays of a part of a row."""
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
@@ -60,7 +60,7 @@ class Rays(NamedTuple):
 
 
 class Ray(NamedTuple):
-    """The row's part of them."""
+    """The row's part of its rays."""
 
     x: np.float32
     y: np.float32
@@ -84,7 +84,7 @@ class Steps(NamedTuple):
 
 @kernel
 def steps_of(grid: Grid, counter: Counter) -> Steps:
-    """The grid and the counter as scalars."""
+    """Return the grid and the counter as scalars."""
     origin, shape = grid.origin, grid.shape
     slots_per_y = np.int32(shape[2] + 2)
     slots_per_x = np.int32(slots_per_y * (shape[1] + 2))
@@ -103,9 +103,9 @@ def slots_of_row(
     steps: Steps,
     slots: NDArray[np.int32],
 ) -> None:
-    """The slot of each pixel of a stretch of a row; written for the vectoriser: no branch, 32 bits, nothing but arrays.
+    """Compute the slot of each pixel in a part of a row; for the vectoriser: no branch, 32 bits, only arrays.
 
-    `outside` for a pixel that is not marked and for a point outside the lattice.
+    The slot is `outside` for a pixel that is not marked and for a point outside the lattice.
     """
     ray_x, ray_y, ray_z = rays
     row_x, row_y, row_z = row
@@ -116,7 +116,7 @@ def slots_of_row(
         gx = (ray_x[i] + row_x) * d + origin_x
         gy = (ray_y[i] + row_y) * d + origin_y
         gz = (ray_z[i] + row_z) * d + origin_z
-        # Below zero is dropped before truncation, so that truncation is floor.
+        # Values below zero are excluded before truncation, so that truncation is floor.
         inside = (gx >= zero) & (gy >= zero) & (gz >= zero) & (gx < limit_x) & (gy < limit_y) & (gz < limit_z)
         slot = np.int32(np.int32(gx) * slots_per_x) + np.int32(np.int32(gy) * slots_per_y) + np.int32(gz)
         slots[i] = np.int32(slot + first_slot) if inside & (mask[i] != 0) else outside
@@ -124,13 +124,13 @@ def slots_of_row(
 
 @kernel
 def tally(slots: NDArray[np.int32], counts: NDArray[np.uint32], touched: NDArray[np.uint32], found: int) -> int:
-    """Count the `slots`, and list those that were empty behind the `found` that `touched` has; returns how many now."""
-    # Unsigned, for a signed index is tested for counting from the end.
+    """Count the `slots`; append those that were empty to the `found` entries of `touched`; return the new number."""
+    # Unsigned, since numba tests a signed index for counting from the end.
     end = np.uint64(found)
     for i in range(len(slots)):
         slot = np.uint32(slots[i])
         count = counts[slot]
-        # Written always and kept when it was the first: a branch would be guessed wrong too often.
+        # Always written, and counted only if it was the first: a branch would be mispredicted too often.
         touched[end] = slot
         end += np.uint64(count == 0)
         counts[slot] = count + np.uint32(1)
@@ -139,8 +139,8 @@ def tally(slots: NDArray[np.int32], counts: NDArray[np.uint32], touched: NDArray
 
 @kernel
 def next_marked(words: NDArray[np.uint64], start: int) -> int:
-    """The first word from `start` on that is not zero, or their number."""
-    # Unsigned, for a signed index is tested for counting from the end.
+    """Return the first word from `start` on that is not zero, or the number of words."""
+    # Unsigned, since numba tests a signed index for counting from the end.
     word, end = np.uint64(start), np.uint64(len(words))
     one, two, three, four = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
     while word + four <= end and words[word] | words[word + one] | words[word + two] | words[word + three] == 0:
@@ -152,7 +152,7 @@ def next_marked(words: NDArray[np.uint64], start: int) -> int:
 
 @kernel
 def next_empty(words: NDArray[np.uint64], start: int) -> int:
-    """The first word from `start` on that is zero, or their number."""
+    """Return the first word from `start` on that is zero, or the number of words."""
     word, end = np.uint64(start), np.uint64(len(words))
     while word < end and words[word] != 0:
         word += np.uint64(1)
@@ -161,9 +161,9 @@ def next_empty(words: NDArray[np.uint64], start: int) -> int:
 
 @kernel
 def count_points(depth_raw: NDArray[np.uint16], mask: Mask, grid: Grid, counter: Counter, found: int) -> int:
-    """Deproject the marked pixels onto the lattice and count them; returns how many voxels were touched until now.
+    """Deproject the marked pixels onto the lattice and count them; return the number of voxels touched so far.
 
-    They are listed behind the `found` that were there before.
+    New voxels are appended to the `found` entries of `counter.touched`.
     """
     mask, grid, counter = Mask(*mask), Grid(*grid), Counter(*counter)
     height, width = depth_raw.shape
@@ -190,6 +190,6 @@ def count_points(depth_raw: NDArray[np.uint16], mask: Mask, grid: Grid, counter:
 
 @kernel
 def forget(counts: NDArray[np.uint32], touched: NDArray[np.uint32], found: int) -> None:
-    """Make the dense counter zero again, in proportion to what was touched."""
+    """Reset the dense counter to zero, at a cost proportional to the number of voxels touched."""
     for i in range(found):
         counts[touched[i]] = 0

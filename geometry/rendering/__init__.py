@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a camera at a known pose would see of meshes and of a robot's links.
+"""Render what a camera at a known pose sees of meshes and of a robot's links.
 
 In the order of the flow:
 
-    vertex_offsets  how a mesh grows by a padding
-    hull_store      hulls kept on disk
-    padded_hull     a link as the solid that reaches a few centimetres around it
-    link_poses      the robot's links as they stand before one camera
-    kernel_camera   a camera's intrinsics as kernels take them
-    mesh_renderer   meshes and links drawn into buffers of inverse depth
+    vertex_offsets  growth of a mesh by a padding, for each vertex
+    hull_store      hulls stored on disk
+    padded_hull     the closed surface at a distance of a few centimetres around a link
+    link_poses      poses of the robot's links in the camera frame
+    kernel_camera   a camera's intrinsics in the form of kernels' arguments
+    mesh_renderer   meshes and links rendered into buffers of inverse depth
 """
 
 from geometry.rendering.link_poses import Links

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Padded hulls kept on disk, so that a robot of fine CAD costs its seconds at the first start only.
+"""Padded hulls stored on disk, so that the hulls of fine CAD cost seconds at the first start only.
 
-They lie beside the compiled kernels, each in a file that is named by its mesh, its distance and the code that made it.
-A file begins with the SHA-256 of its name and of what follows, the hull's canonical bytes; one that is damaged is taken
-out and made anew. Nothing depends on them: where they cannot be written, a warning says so once.
+They are beside the compiled kernels. Each file is named by a digest of its mesh, its distance and the code that made
+it. A file starts with the SHA-256 of its name and of the hull's canonical bytes, which follow. A damaged file is
+removed and its hull made again. Nothing depends on the files: if they cannot be written, one warning says so.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ logger = logging.getLogger(__name__)
 FOLDER = "hulls"
 
 FILES_MAX = 512
-"""Hulls kept: those of some thirty robots, each with its tools and one padding."""
+"""Limit of stored hulls: those of about thirty robots, each with its tools and one padding."""
 
 BYTES_MAX = 64_000_000
-"""Of all files together: a hull has 20 to 40 kB, one that could not be simplified 2 MB."""
+"""Limit of all files together: a hull has 20 to 40 kB, one that could not be simplified 2 MB."""
 
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 def state_of_code(sources: Iterable[Path], libraries: Iterable[str]) -> str:
-    """Return a digest of the code that makes hulls: source files, and libraries as words with their versions.
+    """Return a digest of the code that makes hulls, from source files and from libraries as names with versions.
 
     Raises:
         OSError: a file cannot be read.
@@ -44,16 +44,16 @@ def state_of_code(sources: Iterable[Path], libraries: Iterable[str]) -> str:
 
 
 class HullStore:
-    """Hulls in a folder of their own, at most `FILES_MAX` and `BYTES_MAX`: those not used for longest go first."""
+    """Hulls in a folder of their own, at most `FILES_MAX` and `BYTES_MAX`; the least recently used go first."""
 
     def __init__(self, folder: Path, code_state: str) -> None:
-        """`code_state` changes when the same mesh would have another hull; the folder need not exist."""
+        """Use `folder`, which need not exist; `code_state` changes when the same mesh would have another hull."""
         self._folder = folder
         self._code_state = code_state
         self._warned = False
 
     def load(self, mesh: TriangleMesh, distance_m: float) -> TriangleMesh | None:
-        """Return the hull at `distance_m` around `mesh`; None where it is not kept, or its file was damaged."""
+        """Return the hull at `distance_m` around `mesh`, or None if it is not stored or its file was damaged."""
         path = self._path(mesh, distance_m)
         try:
             if path.stat().st_size > BYTES_MAX:
@@ -61,12 +61,12 @@ class HullStore:
             content = path.read_bytes()
             payload = content[_DIGEST_BYTES:]
             if content[:_DIGEST_BYTES] != _digest(path, payload):
-                raise MeshError("its checksum does not fit")
+                raise MeshError("expected the checksum of its content, got another")
             hull = TriangleMesh.from_bytes(payload, mesh.name)
         except FileNotFoundError:
             return None
         except MeshError as error:
-            logger.warning("%s: damaged, the hull of %s is made anew: %s", path, mesh.name, error)
+            logger.warning("%s: damaged, so the hull of %s is made again: %s", path, mesh.name, error)
             self._remove(path)
             return None
         except OSError as error:
@@ -75,11 +75,11 @@ class HullStore:
         try:
             os.utime(path)
         except OSError as error:
-            logger.debug("%s: its time of use cannot be noted: %s", path, error)
+            logger.debug("%s: cannot update its time of use: %s", path, error)
         return hull
 
     def save(self, mesh: TriangleMesh, distance_m: float, hull: TriangleMesh) -> None:
-        """Keep a hull; what cannot be written is not kept, and a warning says so once."""
+        """Store a hull; if it cannot be written, log one warning."""
         path, payload = self._path(mesh, distance_m), hull.to_bytes()
         size = _DIGEST_BYTES + len(payload)
         if size > BYTES_MAX:
@@ -87,7 +87,7 @@ class HullStore:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._make_room(size)
-            # One that a power cut leaves damaged is found out by its checksum.
+            # The checksum detects a file that a power cut damaged.
             write_whole(path, _digest(path, payload) + payload, synced=False, contended=True)
         except OSError as error:
             self._warn("written", error)
@@ -97,13 +97,13 @@ class HullStore:
         return self._folder / name
 
     def _make_room(self, size: int) -> None:
-        """Take out what was not used for longest, until one more file of so many bytes has room."""
+        """Remove the least recently used files until one more file of this size has room."""
         files = []
         for path in self._folder.iterdir():
             try:
                 status = path.stat()
             except FileNotFoundError:
-                # Another process makes room, too.
+                # Another process may remove files at the same time.
                 continue
             files.append((status.st_mtime_ns, status.st_size, path))
         files.sort()
@@ -124,7 +124,7 @@ class HullStore:
         if not self._warned:
             self._warned = True
             logger.warning(
-                "%s: the hulls of the robots' links cannot be %s (%s): they are made anew at each start",
+                "%s: the hulls of the robots' links cannot be %s (%s); they are made again at each start",
                 self._folder,
                 verb,
                 error,

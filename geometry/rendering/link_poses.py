@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot's links as they stand before one camera, frame by frame."""
+"""Poses of the robot's links in the frame of one camera, frame by frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shared.transforms import Transform
 
 
 class Links:
-    """Poses of a robot's links in the camera frame, with all memory taken beforehand."""
+    """Poses of a robot's links in the camera frame, in memory allocated beforehand."""
 
     def __init__(self, robot: Robot, T_camera_world: Transform) -> None:
         self._robot = robot
@@ -41,19 +41,19 @@ class Links:
         self._displacement_m = np.empty(count)
 
     def place(self, joints: ArrayLike) -> NDArray[np.float64]:
-        """`T_camera_link` (L, 4, 4) at joint positions (n,), rad or m; valid until the next call.
+        """Return `T_camera_link` (L, 4, 4) at joint positions (n,), rad or m; valid until the next call.
 
         Raises:
-            InputError: wrong number of joints, or one is not finite.
+            InputError: the count of joints is wrong, or a value is not finite.
         """
         positions = np.array(self._robot.check_joints(joints))
         forward.place_links(positions, self._T_camera_base, self._moving, self._carried, self._stand)
         return self._poses
 
     def displacement_m(self, uncertainty: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far (L,) any point of each link moves at most from where it was placed when joints are off (n,).
+        """Return the largest motion (L,), metres, of any point of each link for joint errors of `uncertainty` (n,).
 
-        Valid until the next call; see `Robot.displacement_m`.
+        The motion is from the poses of the last `place`. Valid until the next call; see `Robot.displacement_m`.
         """
         forward.displace_links(uncertainty, self._moving, self._carried, self._stand, self._displacement_m)
         return self._displacement_m

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Meshes and the links of a robot drawn into buffers of inverse depth, with all memory taken beforehand."""
+"""Meshes and the links of a robot rendered into buffers of inverse depth, in memory allocated beforehand."""
 
 from __future__ import annotations
 
@@ -21,45 +21,45 @@ from shared.meshes import TriangleMesh
 Number = TypeVar("Number", np.float32, np.int32)
 
 NEAR_PLANE_M = 0.01
-"""Nearer than any depth camera measures; triangles are clipped here."""
+"""Near plane, where triangles are clipped: nearer than the range of any depth camera."""
 
 STILL_M = 0.0005
-"""Encoders tremble: links that moved by less than this since they were drawn are not drawn again."""
+"""Encoder noise: links that moved by less than this since they were last drawn are not drawn again."""
 
 KEPT_AFTER = 3
-"""A link that stood still for so many drawings is kept aside, and the others are drawn over it. At once would be too
-early: a robot that stops and goes by turns would have everything drawn twice."""
+"""Number of drawings for which a link must be still before it is kept in a buffer of its own, under the other links.
+With 1, a robot that stops and starts by turns would have everything drawn twice."""
 
 
 class DepthBuffer:
-    """Nearest and farthest inverse depth, 1/m, of a window of the picture, as `rasterize` has it.
+    """Nearest and farthest inverse depth, 1/m, of a window of the image; `rasterize` explains the format.
 
     Attributes:
-        bundle: all of it, for kernels.
+        bundle: all arrays, for kernels.
     """
 
     def __init__(self, intrinsics: Intrinsics, farthest: bool = False) -> None:
-        """Without `farthest` only the nearest is drawn."""
+        """Allocate the buffer; without `farthest` it holds only the nearest surface."""
         size = intrinsics.height * (intrinsics.width + rasterize.LANES) + rasterize.LANES
         self.nearest_w = np.zeros(size, np.float32)
         self.farthest_w = np.zeros(size if farthest else 0, np.float32)
         self.window = np.zeros(4, np.int64)
         self.bundle = plain(Buffer(self.window, self.nearest_w, self.farthest_w))
 
-    def nearest_in(self, picture_w: NDArray[np.float32], rectangles: NDArray[np.int32]) -> None:
-        """Write what was drawn inside the `rectangles` (M, 4) into `picture_w` (H, W)."""
+    def nearest_in(self, image_w: NDArray[np.float32], rectangles: NDArray[np.int32]) -> None:
+        """Copy the pixels inside the `rectangles` (M, 4) into `image_w` (H, W)."""
         row, column, rows, stride = self.window.tolist()
         window_w = self.nearest_w[: rows * stride].reshape(rows, stride)
         for top, bottom, left, right in rectangles.tolist():
             part = window_w[top - row : bottom + 1 - row, left - column : right + 1 - column]
-            picture_w[top : bottom + 1, left : right + 1] = part
+            image_w[top : bottom + 1, left : right + 1] = part
 
 
 class MeshBatch:
-    """Several meshes as the flat arrays that `rasterize.draw_meshes` takes, with scratch memory for them."""
+    """Several meshes as the flat arrays of `rasterize.draw_meshes`, with scratch memory."""
 
     def __init__(self, intrinsics: Intrinsics, meshes: Sequence[TriangleMesh], inflate: bool) -> None:
-        """`inflate` prepares the offsets by which meshes grow; without it they are drawn as they are."""
+        """Prepare the meshes; with `inflate`, also the offsets by which they grow, else they never grow."""
         self.count = len(meshes)
         self.all = np.ones(self.count, np.bool_)
         self.rectangles = np.tile(np.array([intrinsics.height, -1, intrinsics.width, -1], np.int32), (self.count, 1))
@@ -89,7 +89,7 @@ class MeshBatch:
         )
 
     def draw(self, T_camera_mesh: NDArray[np.float64], padding_m: NDArray[np.float32], buffer: DepthBuffer) -> None:
-        """Draw all meshes at poses (M, 4, 4), each grown by its padding (M,), into `buffer`."""
+        """Draw all meshes at poses (M, 4, 4), each inflated by its padding (M,) in metres, into `buffer`."""
         self.draw_over(buffer, ~self.all, T_camera_mesh, padding_m, buffer, self.all)
 
     def draw_over(
@@ -101,7 +101,7 @@ class MeshBatch:
         buffer: DepthBuffer,
         chosen: NDArray[np.bool_],
     ) -> None:
-        """Draw the `chosen` (M,) of the meshes over what is `kept` of the `others` (M,)."""
+        """Draw the `chosen` (M,) meshes over the content of `kept`, which holds the `others` (M,)."""
         rasterize.draw_meshes(
             self._meshes,
             chosen,
@@ -117,16 +117,16 @@ class MeshBatch:
 
 
 class LinkDrawing:
-    """A robot's links on the screen, of which only those are drawn again that moved.
+    """Rendering of a robot's links that draws only links that moved.
 
     Attributes:
-        buffer: what was drawn last.
+        buffer: the result of the last drawing.
     """
 
     def __init__(
         self, intrinsics: Intrinsics, meshes: Sequence[TriangleMesh], inflate: bool, farthest: bool = False
     ) -> None:
-        """`inflate` as for a `MeshBatch`, `farthest` as for a `DepthBuffer`."""
+        """Prepare the links; `inflate` as for `MeshBatch`, `farthest` as for `DepthBuffer`."""
         self._batch = MeshBatch(intrinsics, meshes, inflate)
         self._reach_m = np.array([float(np.linalg.norm(mesh.vertices, axis=1).max()) for mesh in meshes])
         self.buffer = DepthBuffer(intrinsics, farthest)
@@ -136,7 +136,7 @@ class LinkDrawing:
         self._stillness = plain(motion.Stillness(STILL_M, KEPT_AFTER))
         self._drawn = plain(
             motion.Drawn(
-                # Nowhere yet.
+                # NaN: not drawn yet.
                 poses=np.full((self._batch.count, 4, 4), np.nan),
                 padding_m=np.zeros(self._batch.count, np.float32),
                 still_for=np.zeros(self._batch.count, np.int64),
@@ -147,18 +147,18 @@ class LinkDrawing:
 
     @property
     def rectangles(self) -> NDArray[np.int32]:
-        """First and last row, first and last column (L, 4) that each link may have touched."""
+        """First and last row, first and last column (L, 4) of the pixels that each link may touch."""
         return self._batch.rectangles
 
     @property
     def all(self) -> NDArray[np.bool_]:
-        """All links (L,)."""
+        """A mask (L,) that selects all links."""
         return self._batch.all
 
     def draw(self, T_camera_link: NDArray[np.float64], padding_m: NDArray[np.float32], anew: bool = True) -> bool:
-        """Draw the links at poses (L, 4, 4), each grown by its padding (L,) m.
+        """Draw the links at poses (L, 4, 4), each inflated by its padding (L,) in metres.
 
-        Unless it must be `anew`, nothing is drawn and False returned when no vertex has moved by more than STILL_M.
+        Without `anew`, draw nothing and return False if no vertex has moved by more than STILL_M.
         """
         found = motion.settle(
             T_camera_link,
@@ -178,5 +178,5 @@ class LinkDrawing:
 
 
 def _columns(parts: Sequence[NDArray[Number]], dtype: type[Number]) -> NDArray[Number]:
-    """Arrays (N, 3) one after the other as (3, sum of N): each coordinate by itself."""
+    """Concatenate arrays (N, 3), and transpose to (3, sum of N) so that each coordinate is contiguous."""
     return np.ascontiguousarray(np.concatenate([*parts, np.zeros((0, 3), dtype)]).T)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A link as the solid that reaches its padding around it: what is drawn of the robot for the filter.
+"""The closed surface at a padding's distance around a link, which represents the robot in the filter.
 
-CAD of robots is fine, full of parts that nobody sees, and seldom closed. The surface at some distance around it is
-smooth, closed and has few triangles, whatever the mesh was like.
+CAD of robots is fine, has many invisible inner parts, and is seldom closed. The surface at some distance around it is
+smooth and closed and has few triangles, for any mesh.
 """
 
 from __future__ import annotations
@@ -25,39 +25,39 @@ from shared.meshes import TriangleMesh
 logger = logging.getLogger(__name__)
 
 DISTANCE_MIN_M = 0.015
-"""A nearer hull would need a grid too fine for its size."""
+"""Least distance: a nearer hull would need a grid too fine for its size."""
 
 GRID_SHARE = 0.25
-"""Spacing of the grid in parts of the distance, which is the hull's narrowest bend."""
+"""Grid spacing as a share of the distance, which is the smallest radius of curvature of the hull."""
 
 GRID_NODES_MAX = 2_000_000
-"""8 MB of distances; for a larger link the grid is coarser."""
+"""Limit of grid nodes: 8 MB of distances; the grid of a larger link is coarser."""
 
 SAMPLE_SHARE = 0.1
-"""Spacing of the points that stand for the mesh in parts of the distance; it changes that by less than a hundredth."""
+"""Spacing of the sample points of the mesh as a share of the distance; the error of the distance is below 1 %."""
 
 SAMPLES_AT_ONCE = 1_000_000
-"""Some 60 MB while they are thinned out. Long, thin triangles, of which CAD is full, are covered by many more than are
-needed: all at once took 1.7 GB for a smooth cylinder of 1.2 m."""
+"""Samples processed at once: about 60 MB while they are thinned out. Long, thin triangles, which CAD is full of, get
+many more samples than necessary: all at once took 1.7 GB for a smooth cylinder of 1.2 m."""
 
 SIMPLIFY_MAX_M, SIMPLIFY_SHARE = 0.002, 1.0 / 15.0
-"""How far the simplified hull may leave the grid's, at most and in parts of the distance: half of it would mean nearly
-twice as many triangles to draw."""
+"""Tolerance of the simplification, absolute and as a share of the distance. Half of it would mean nearly twice as many
+triangles to draw."""
 
 LIFT = 0.25
-"""By this part of it the hull is made larger beforehand: triangles between fewer corners cut off what is round."""
+"""Pre-inflate by this share of the tolerance, since the simplification cuts convex corners."""
 
 HULLS_MAX = 64
-"""Hulls kept for meshes met again, as when the cell is sent anew: two arms with their tools."""
+"""Limit of hulls in memory for meshes that come again, for example when the cell is sent again: two arms with tools."""
 
 _hulls: dict[tuple[str, float], TriangleMesh] = {}
 
 
 def hull_around(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
-    """The outer surface at `distance_m` from `mesh`, within some 3 mm; closed, however open the mesh was.
+    """Return the outer surface at `distance_m` from `mesh`, within about 3 mm; closed even when the mesh is open.
 
-    Takes some hundredths of a second, and seconds for fine CAD of a large link; the same mesh has its hull at once, at
-    the next start from the disk.
+    It takes some hundredths of a second, and seconds for fine CAD of a large link. The hull of the same mesh is then in
+    memory, and at the next start on the disk.
 
     Raises:
         InputError: the distance is below `DISTANCE_MIN_M`.
@@ -79,7 +79,7 @@ def _store() -> HullStore:
 
 
 def _kept_hull(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
-    """The hull from the disk; where it is not there, it is made and kept."""
+    """Return the hull from the disk, or make and store it."""
     store = _store()
     hull = store.load(mesh, distance_m)
     if hull is None:
@@ -89,7 +89,7 @@ def _kept_hull(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
 
 
 def _make_hull(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
-    """What `hull_around` keeps."""
+    """Make the hull of `hull_around`."""
     grid_m = GRID_SHARE * distance_m
     low = mesh.vertices.min(axis=0) - np.float32(distance_m + 3.0 * grid_m)
     size = mesh.vertices.max(axis=0) + np.float32(distance_m + 3.0 * grid_m) - low
@@ -100,7 +100,7 @@ def _make_hull(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
     field = _distance(mesh, low, shape, grid_m, lifted_m) - np.float32(lifted_m)
     outside = np.empty(field.shape, np.bool_)
     kernels.flood_outside(field < 0.0, outside, np.empty(field.size, np.int64))
-    # A cavity is inside, too.
+    # A cavity belongs to the inside.
     field[~outside & (field >= 0.0)] = -grid_m
     vertices, faces = _surface(field)
     return _simplified(mesh.name, (vertices * np.float32(grid_m) + low).astype(np.float32), faces, simplify_m)
@@ -109,7 +109,7 @@ def _make_hull(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
 def _distance(
     mesh: TriangleMesh, origin_m: NDArray[np.float32], shape: NDArray[np.int64], grid_m: float, distance_m: float
 ) -> NDArray[np.float32]:
-    """Distance (nx, ny, nz) in metres of the grid's nodes from the mesh, as far as it matters."""
+    """Return the distance (nx, ny, nz), metres, of the grid's nodes from the mesh, cut above about `distance_m`."""
     spacing_m = SAMPLE_SHARE * distance_m
     reach = int(np.ceil((distance_m + grid_m) / grid_m))
     far_m = distance_m + 2.0 * grid_m
@@ -124,7 +124,7 @@ def _distance(
 
 
 def _thinned(samples_m: NDArray[np.float32], grain_m: float) -> NDArray[np.float32]:
-    """Of points (S, 3) one for each grain: fine meshes give many more than are needed."""
+    """Return one of the points (S, 3) for each grain; fine meshes give many more than necessary."""
     grain = np.floor(samples_m / grain_m).astype(np.int64)
     grain -= grain.min(axis=0)
     _, first = np.unique(np.ravel_multi_index(tuple(grain.T), tuple(grain.max(axis=0) + 1)), return_index=True)
@@ -132,7 +132,7 @@ def _thinned(samples_m: NDArray[np.float32], grain_m: float) -> NDArray[np.float
 
 
 def _surface(field: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Vertices (V, 3) in nodes and faces (F, 3) of the zero surface."""
+    """Return vertices (V, 3), in nodes, and faces (F, 3) of the zero surface."""
     cells = np.empty(field.shape, np.int32)
     numbers = kernels.surface_net(field, cells, np.empty((0, 3), np.float32), np.empty((0, 3), np.int32))
     vertices, faces = np.empty((numbers[0], 3), np.float32), np.empty((numbers[1], 3), np.int32)
@@ -143,7 +143,7 @@ def _surface(field: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[n
 def _simplified(
     name: str, vertices_m: NDArray[np.float32], faces: NDArray[np.int32], tolerance_m: float
 ) -> TriangleMesh:
-    """With as few triangles as `tolerance_m` allows."""
+    """Return the mesh with as few triangles as `tolerance_m` allows."""
     solid = manifold3d.Manifold(manifold3d.Mesh(vertices_m, faces.astype(np.uint32)))
     if solid.status() == manifold3d.Error.NoError and solid.num_tri() > 0:
         found = solid.simplify(tolerance_m).to_mesh()

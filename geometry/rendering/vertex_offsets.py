@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a mesh grows by a padding: per vertex, the direction and length of one metre of growth.
+"""Growth of a mesh by a padding: for each vertex, its motion for one metre of padding.
 
-Links that are inflated when they are loaded pad silhouette and depth in one render, and cost nothing per frame.
+Links inflated at load time pad silhouette and depth in one rendering, at no cost for each frame.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from shared.meshes import TriangleMesh
 
 OFFSET_MAX = 2.0
-"""A corner's tip moves by at most this times the padding; the tip of a needle would run away."""
+"""Limit of a vertex's motion in paddings; the tip of a needle would move without bound."""
 
 RIDGE = 1e-3
-"""Weight of staying put: on a smooth surface it fixes the two directions that the faces leave free."""
+"""Weight of a regularisation: on a smooth surface it fixes the two directions that the faces leave free."""
 
 
 def vertex_offsets(mesh: TriangleMesh) -> NDArray[np.float32]:
-    """Offsets (V, 3) such that `vertices + padding * offsets` moves every face outward by about `padding`.
+    """Return offsets (V, 3) such that `vertices + padding * offsets` moves every face outward by about `padding`.
 
-    A mere mean of normals would leave the faces of a box at 58 % of the padding. Here each vertex solves, in the least
-    squares sense, `normal . offset = 1` for all faces that meet in it, weighted by their angle there.
+    The mean of the normals would move the faces of a box by only 58 % of the padding. Instead, each vertex solves
+    `normal . offset = 1` in the least-squares sense for all faces that meet in it, weighted by their angle there.
     """
     corners = mesh.vertices.astype(np.float64)[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -41,6 +41,6 @@ def vertex_offsets(mesh: TriangleMesh) -> NDArray[np.float32]:
 
 
 def _corner_angle(at: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angle (F,) in rad at the corners `at` (F, 3) between the sides to `one` and to `other`."""
+    """Return the angles (F,) in rad at the corners `at` (F, 3) between the sides to `one` and to `other`."""
     a, b = one - at, other - at
     return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ij,ij->i", a, b)))

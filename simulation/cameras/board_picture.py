@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a camera's picture shows of the calibration board: perspective, antialiased, blurred, with noise."""
+"""Images of the calibration board in a camera: perspective, antialiased, blurred, with noise."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from simulation.world.world import World
 
 TEXTURE_PX_PER_M = 8000.0
 TEXTURE_MAX_PX = 6000
-"""A board is drawn once at 0.125 mm a pixel, with exact grey at its edges, or coarser if it is large."""
+"""A board is drawn once at 0.125 mm a pixel, with exact grey at its edges; coarser if it is large."""
 
 TEXTURE_PX_A_RAY = 1.5
-"""At the least, so that what lies between two rays is not lost."""
+"""Least number of texture pixels for each ray, so that no texture between two rays is lost."""
 
 SUPERSAMPLING = 4
 """Rays along each side of a pixel."""
 
 THICKNESS_M = 0.005
-"""A board lies on a surface; what is nearer by this much hides it."""
+"""Least distance before the board at which an object hides it, since a board lies on a surface."""
 
 MARGIN_SQUARES = 0.5
-"""White paper about the pattern."""
+"""White paper around the pattern."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class PictureQuality:
 
 
 class BoardPicture:
-    """Draws one board as one camera sees it."""
+    """Draw one board in the image of one camera."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class BoardPicture:
         quality: PictureQuality | None = None,
         px_per_m: float = TEXTURE_PX_PER_M,
     ) -> None:
-        """The board itself is drawn at `px_per_m` at most, which a board that is far away may have less of."""
+        """Draw the board's texture, at most at `px_per_m`; a board that is far away needs less."""
         self._intrinsics = intrinsics
         self._quality = quality or PictureQuality()
         self._margin_m = MARGIN_SQUARES * layout.board.square_m
@@ -64,7 +64,7 @@ class BoardPicture:
         self._texture = self._drawn(layout)
 
     def part(self, T_camera_board: Transform) -> tuple[slice, slice] | None:
-        """Rows and columns in which the board is seen; None where it is not, or from behind."""
+        """Return the rows and columns that contain the board, or None if it is not in view or seen from behind."""
         camera = self._intrinsics
         (width_m, height_m), margin_m = self._size_m, self._margin_m
         outline_m = np.array(((0, 0, 0), (width_m, 0, 0), (width_m, height_m, 0), (0, height_m, 0))) - (
@@ -82,7 +82,7 @@ class BoardPicture:
         return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
 
     def expose(self, T_camera_board: Transform, hidden: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-        """The picture (H, W) float32 without noise; the board is not seen where `hidden` (H, W), nor from behind."""
+        """Return the image (H, W) float32 without noise; `hidden` (H, W) pixels and the back do not show the board."""
         camera, quality, margin_m = self._intrinsics, self._quality, self._margin_m
         image = np.full(camera.shape, quality.surroundings, dtype=np.float32)
         seen_in = self.part(T_camera_board)
@@ -114,17 +114,17 @@ class BoardPicture:
         if hidden is not None:
             image[hidden] = quality.surroundings
         if quality.blur_px > 0.0:
-            # Beyond the board all is grey, so its surroundings need no blur.
+            # Beyond the board the image is uniformly grey, so its surroundings need no blur.
             part[:] = cv2.GaussianBlur(part, (0, 0), quality.blur_px)
         return image
 
     def develop(self, exposed: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint8]:
-        """A frame (H, W) uint8 of the picture, with noise of its own."""
+        """Return the image as a frame (H, W) uint8, with new noise."""
         noise = rng.standard_normal(exposed.shape, dtype=np.float32) * np.float32(self._quality.noise)
         return np.asarray(np.clip(exposed + noise + 0.5, 0.0, 255.0), dtype=np.uint8)
 
     def _drawn(self, layout: BoardLayout) -> NDArray[np.float32]:
-        """The board with its margin, (H, W) float32: each pixel the mean of what it covers."""
+        """Draw the board with its margin, (H, W) float32; each pixel is the mean of the area that it covers."""
         px = self._px_per_m
         width, height = (round(side * px) for side in self._size_m)
         black = np.zeros((height, width), dtype=np.float32)
@@ -137,7 +137,7 @@ class BoardPicture:
 
 
 def _covered(low: float, high: float) -> tuple[slice, NDArray[np.float32]]:
-    """Which pixels an interval touches, and how much of each."""
+    """Return the pixels that an interval touches, and the covered share of each."""
     first, last = int(np.floor(low)), int(np.ceil(high))
     edges = np.arange(first, last + 1)
     covered = np.diff(np.clip(edges, low, high)).astype(np.float32)
@@ -145,10 +145,10 @@ def _covered(low: float, high: float) -> tuple[slice, NDArray[np.float32]]:
 
 
 class BoardCamera:
-    """An image stream of a depth camera that hangs still in a world with a board, its emitter off."""
+    """An image stream of a fixed depth camera in a world with a board, with its emitter off."""
 
     def __init__(self, world: World, T_world_depth: Transform, stream: ImageStream, seed: int) -> None:
-        """A cell without a board is a grey picture."""
+        """Prepare the stream; the image of a cell without a board is grey."""
         focal_px, T_depth_image = _STREAMS[stream]
         self.stream: ImageStream = stream
         self.T_depth_image = T_depth_image
@@ -165,7 +165,7 @@ class BoardCamera:
             nearest_m = float(np.linalg.norm(self._T_image_board[:3, 3])) - float(np.hypot(*layout.size_m))
             px_per_m = TEXTURE_PX_A_RAY * SUPERSAMPLING * focal_px / max(nearest_m, 0.1)
             self._picture = BoardPicture(layout, self.intrinsics, px_per_m=px_per_m)
-        # What stands elsewhere in the picture is not drawn.
+        # Other objects in the image are not drawn.
         self._part: tuple[slice, slice] | None = None
         if self._picture is not None and self._T_image_board is not None:
             self._part = self._picture.part(self._T_image_board)
@@ -175,7 +175,7 @@ class BoardCamera:
             self._hiding_z_m = _plane_z_m(part, self._T_image_board) - THICKNESS_M
 
     def take(self, t_s: float) -> NDArray[np.uint8]:
-        """The picture (720, 1280) uint8 taken at `t_s`, RGB for colour; what stands before the board hides it."""
+        """Return the image (720, 1280) uint8 taken at `t_s`, RGB for colour; objects before the board hide it."""
         picture, T_image_board = self._picture, self._T_image_board
         if picture is None or T_image_board is None:
             return np.full(self.intrinsics.shape, round(PictureQuality().surroundings), np.uint8)
@@ -187,14 +187,14 @@ class BoardCamera:
 
 
 def _cut_out(camera: Intrinsics, part: tuple[slice, slice]) -> Intrinsics:
-    """The camera of a part of the picture."""
+    """Return the intrinsics of a part of the image."""
     rows, columns = part
     height, width = rows.stop - rows.start, columns.stop - columns.start
     return Intrinsics(width, height, camera.fx, camera.fy, camera.cx - columns.start, camera.cy - rows.start)
 
 
 def _plane_z_m(camera: Intrinsics, T_image_board: Transform) -> NDArray[np.float64]:
-    """Depth (H, W) at which each pixel's ray meets the board's plane; where it does not, it means nothing."""
+    """Return the depth (H, W) at which each pixel's ray meets the board's plane; arbitrary if it does not."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
     normal, origin_m = T_image_board[:3, 2], T_image_board[:3, 3]
     along = normal[0] * (u - camera.cx) / camera.fx + normal[1] * (v - camera.cy) / camera.fy + normal[2]

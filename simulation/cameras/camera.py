@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A depth camera in the world, and where a cell's cameras hang."""
+"""A depth camera in the world, and the positions of a cell's cameras."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from simulation.world.world import World
 RendererName = Literal["raster", "raycast"]
 
 D435I_FOCAL_PX = {(424, 240): 213.0, (640, 480): 385.0, (848, 480): 425.0, (1280, 720): 640.0}
-"""Depth profiles of a D435i and their focal lengths: some 87 degrees wide, 640x480 cut out of a wider picture."""
+"""Depth profiles of a D435i and their focal lengths: about 87 degrees wide; 640x480 is cut out of a wider image."""
 
 MAX_RIG = 50
-"""As many cameras as the largest cells have."""
+"""Limit of cameras: as many as the largest cells have."""
 
 RIG_OUTSIDE_M = 0.15
-"""How far outside the cell's box the cameras hang."""
+"""Distance of the cameras outside the cell's box."""
 
 MOMENTS_PER_S = 1_000_000
-"""Frames less than a microsecond apart have the same noise."""
+"""Resolution of a frame's time: frames less than a microsecond apart have the same noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedFrame:
-    """A frame and the truth behind it.
+    """A frame with its ground truth.
 
     Attributes:
         depth: (H, W) uint16 as the camera measures it, in units of depth_scale_m.
-        view: what a perfect camera would see: true depth and owner.
-        joints: (n,) rad at the frame's time; none without a robot.
+        view: the view of a perfect camera: true depth and owner.
+        joints: (n,) rad at the frame's time; None without a robot.
     """
 
     depth: NDArray[np.uint16]
@@ -49,17 +49,17 @@ class SimulatedFrame:
 
     @property
     def true_z_m(self) -> NDArray[np.float32]:
-        """(H, W) float32 metres, inf where nothing stands."""
+        """True depth (H, W) float32 in metres, inf for pixels without a surface."""
         return self.view.z_m
 
     @property
     def owner(self) -> NDArray[np.uint8]:
-        """(H, W), see `Owner`."""
+        """Owner of each pixel's surface (H, W), see `Owner`."""
         return self.view.owner
 
 
 class SimulatedCamera:
-    """A depth camera that hangs still in a world. Equal arguments, equal frames."""
+    """A fixed depth camera in a world. Equal arguments give equal frames."""
 
     def __init__(
         self,
@@ -78,11 +78,11 @@ class SimulatedCamera:
         self._sensor = DepthSensor(intrinsics, self.noise, seed)
 
     def look(self, t_s: float) -> View:
-        """What a perfect camera sees at `t_s`."""
+        """Return the view of a perfect camera at `t_s`."""
         return self._renderer.render(self.world.scene(t_s))
 
     def capture(self, t_s: float) -> SimulatedFrame:
-        """The frame taken at `t_s`, and the truth behind it."""
+        """Return the frame taken at `t_s`, with its ground truth."""
         view = self.look(t_s)
         depth = self._sensor.measure(view.z_m, round(t_s * MOMENTS_PER_S))
         return SimulatedFrame(depth, view, self.world.joints_at(t_s))
@@ -91,17 +91,17 @@ class SimulatedCamera:
 def _renderer(name: RendererName, intrinsics: Intrinsics, T_world_camera: Transform) -> Renderer:
     if name == "raster":
         return RasterRenderer(intrinsics, T_world_camera)
-    # Embree exists for no ARM board, on which a simulated camera stands in for a real one.
+    # Embree does not exist for ARM boards, where a simulated camera can replace a real one.
     from simulation.cameras.raycast import RaycastRenderer
 
     return RaycastRenderer(intrinsics, T_world_camera)
 
 
 def d435i_intrinsics(width: int = 848, height: int = 480) -> Intrinsics:
-    """Those of a D435i's depth stream.
+    """Return the intrinsics of a D435i's depth stream.
 
     Raises:
-        InputError: it has no such profile.
+        InputError: the camera has no such profile.
     """
     focal_px = D435I_FOCAL_PX.get((width, height))
     if focal_px is None:
@@ -111,10 +111,10 @@ def d435i_intrinsics(width: int = 848, height: int = 480) -> Intrinsics:
 
 
 def rig(cell: Cell, count: int = 4) -> tuple[Transform, ...]:
-    """`T_world_camera` of `count` cameras about a cell's box, looking into it from above.
+    """Return `T_world_camera` of `count` cameras around a cell's box, directed into it from above.
 
-    The first four hang at its upper corners, opposite ones first; more fill the gaps between, every other four lower.
-    A rig of fewer cameras is the beginning of a larger one.
+    The first four are at its upper corners, opposite ones first. More cameras fill the gaps between them, every other
+    four lower. A rig of fewer cameras is the first part of a larger one.
 
     Raises:
         InputError: `count` is not 1 to `MAX_RIG`.
@@ -137,7 +137,7 @@ def rig(cell: Cell, count: int = 4) -> tuple[Transform, ...]:
 
 
 def _halving(index: int) -> float:
-    """0, 1/2, 1/4, 3/4, 1/8 ...: each number falls into the largest gap (van der Corput)."""
+    """Return 0, 1/2, 1/4, 3/4, 1/8 ...: each number is in the largest gap (van der Corput)."""
     value, step = 0.0, 0.5
     while index:
         value += step * (index & 1)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The faults of a stereo depth camera, applied to true depth.
 
-In the order in which a frame meets them: near objects grow into the background (the halo of matching by windows),
-the left imager sees what the right one does not (shadow on the left of near objects), pixels at edges take a
-depth between the surfaces, disparity is noisy (smooth over the matching window, a little by pixel) and quantised,
-and what is too near, too far, seen at a grazing angle, or simply not matched is 0.
+In the order in which they apply: near objects grow into the background (the halo of window matching); the left imager
+sees areas that the right one does not (shadow on the left of near objects); pixels at edges take a depth between the
+surfaces; disparity is noisy (smooth over the matching window, with a small part of each pixel) and quantised; points
+that are too near, too far, at a grazing angle or not matched give 0.
 
 Noise, its smoothness, the step of disparity and the halo follow measurements on recorded frames of a real camera.
 """
@@ -28,23 +28,24 @@ from geometry.rendering.kernel_camera import camera_of
 from shared.camera import Intrinsics
 
 STEP_BASE_M, STEP_SHARE = 0.03, 0.04
-"""Two pixels belong to different surfaces when the farther is beyond the nearer by this much and this share of it."""
+"""Two pixels belong to different surfaces if the farther exceeds the nearer by this length plus this share of it."""
 
 GAUSS_BITS = 16
-"""Quantiles of the table of normal numbers: it ends at 4.3 standard deviations."""
+"""Bits of the index of the table of normal quantiles: it ends at 4.3 standard deviations."""
 
 SIGMA_STEP_M, SIGMA_END_M = 0.005, 20.0
-"""The table of standard deviations over depth; beyond its end the last value holds."""
+"""Step and end of the table of standard deviations over depth; beyond its end the last value holds."""
 
 PERSISTENT_SHARE = 0.8
-"""Of the variance of where holes and ragged borders lie: a surface without texture keeps its hole, which flickers."""
+"""Constant share of the variance of the fields of holes and ragged borders: a surface without texture keeps its hole,
+which flickers."""
 
 
 _LOW_64 = 0xFFFF_FFFF_FFFF_FFFF
 
 
 class DepthNoise(BaseModel):
-    """Which faults, and how strong; the defaults are a D435i. Each is off when its figure is 0."""
+    """Faults and their strengths; the defaults are those of a D435i. A fault is off if its value is 0."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -66,25 +67,27 @@ class DepthNoise(BaseModel):
         "in disparity, so a coarser camera is noisier. The recorded camera's was 430. None: the table holds for all.",
     )
     pixel_share: float = Field(
-        default=0.1, ge=0.0, le=1.0, description="Share of the noise's variance that is each pixel's own."
+        default=0.1, ge=0.0, le=1.0, description="Share of the noise's variance that is independent for each pixel."
     )
     smooth_px: int = Field(default=8, ge=1, le=64, description="Pixels over which the rest of the noise is smooth.")
     disparity_step_px: float = Field(default=1.0 / 32.0, ge=0.0, le=1.0, description="Quantum of disparity.")
     disparity_max_px: float = Field(
-        default=126.0, ge=0.0, le=512.0, description="Largest disparity that is searched: what is nearer is not seen."
+        default=126.0, ge=0.0, le=512.0, description="Largest disparity searched; nearer points are not measured."
     )
-    range_max_m: float = Field(default=10.0, ge=0.0, le=60.0, description="What is farther is not seen.")
-    halo_m: float = Field(default=0.03, ge=0.0, le=0.2, description="How far near objects grow.")
+    range_max_m: float = Field(default=10.0, ge=0.0, le=60.0, description="Largest depth measured, in metres.")
+    halo_m: float = Field(default=0.03, ge=0.0, le=0.2, description="Width by which near objects grow, in metres.")
     halo_ragged: float = Field(default=0.4, ge=0.0, le=1.0, description="Share by which the halo's width varies.")
     flying_share: float = Field(
         default=0.3, ge=0.0, le=1.0, description="Share of the pixels at an edge that lie between the surfaces."
     )
-    flying_px: int = Field(default=2, ge=1, le=4, description="How far from an edge pixels may fly.")
-    shadow: bool = Field(default=True, description="No depth where only the left imager sees.")
-    grazing_from_deg: float = Field(
-        default=80.0, ge=0.0, le=90.0, description="Incidence from which pixels begin to fail; all do at 90. 90 is off."
+    flying_px: int = Field(
+        default=2, ge=1, le=4, description="Largest distance of flying pixels from an edge, in pixels."
     )
-    hole_share: float = Field(default=0.01, ge=0.0, le=0.5, description="Share of the picture in holes.")
+    shadow: bool = Field(default=True, description="No depth in areas that only the left imager sees.")
+    grazing_from_deg: float = Field(
+        default=80.0, ge=0.0, le=90.0, description="Incidence above which pixels fail, all of them at 90; 90 is off."
+    )
+    hole_share: float = Field(default=0.01, ge=0.0, le=0.5, description="Share of the image in holes.")
     hole_px: int = Field(default=12, ge=1, le=64, description="Size of holes; they are twice as wide as high.")
 
     @model_validator(mode="after")
@@ -99,16 +102,16 @@ class DepthNoise(BaseModel):
 
     @classmethod
     def none(cls) -> DepthNoise:
-        """A perfect camera, but for the rounding to its depth unit."""
+        """Return a perfect camera, except for the rounding to its depth unit."""
         return cls(
             sigma_gain=0.0, disparity_step_px=0.0, disparity_max_px=0.0, range_max_m=0.0, halo_m=0.0, flying_share=0.0,
             shadow=False, grazing_from_deg=90.0, hole_share=0.0,
         )  # fmt: skip
 
     def sigma_of(self, z_m: NDArray[np.float64], intrinsics: Intrinsics) -> NDArray[np.float64]:
-        """Standard deviation in metres of the depth that this camera measures at true depths `z_m` > 0."""
+        """Return the standard deviation in metres of measured depth at true depths `z_m` > 0."""
         at_m, sigma_m = np.array(self.sigma_at_m), np.array(self.sigma_m)
-        # Over z² the table is nearly flat, and beyond its ends it is.
+        # Divided by z², the table is nearly flat, and constant beyond its ends.
         level = np.interp(np.log(z_m), np.log(at_m), np.log(sigma_m / at_m**2))
         gain = self.sigma_gain
         if self.sigma_focal_px is not None:
@@ -117,10 +120,10 @@ class DepthNoise(BaseModel):
 
 
 class Faults(NamedTuple):
-    """What `measure` does to a frame: those of `DepthNoise` as it reckons with them.
+    """Faults of `measure`: the parameters of `DepthNoise` in the form of its computation.
 
-    `focal_baseline` in px·m. A pixel's deviation is a sum of its own noise and the smooth one, by their weights. Holes
-    lie where their field is above `hole_level`.
+    `focal_baseline` is in px·m. A pixel's deviation is the weighted sum of its own noise and the smooth noise. Holes
+    are the pixels whose field is above `hole_level`.
     """
 
     focal_baseline: float
@@ -138,7 +141,7 @@ class Faults(NamedTuple):
 
 
 class Chance(NamedTuple):
-    """A frame's chance: `smooth` and `blobs` (H, W), fields of unit variance, the table `gauss`, and a `key`."""
+    """Random inputs of a frame: `smooth` and `blobs` (H, W) of unit variance, the table `gauss`, and a `key`."""
 
     smooth: NDArray[np.float32]
     blobs: NDArray[np.float32]
@@ -147,7 +150,7 @@ class Chance(NamedTuple):
 
 
 class Sides(NamedTuple):
-    """How much deeper a surface gets over one pixel, on either side and above and below."""
+    """Increase of a surface's depth over one pixel, to the left and right, and above and below."""
 
     from_left: float
     to_right: float
@@ -156,7 +159,7 @@ class Sides(NamedTuple):
 
 
 class DepthSensor:
-    """Turns what a perfect camera would see into what a depth camera delivers."""
+    """Turn the view of a perfect camera into the image of a depth camera."""
 
     def __init__(self, intrinsics: Intrinsics, noise: DepthNoise, seed: int) -> None:
         self._intrinsics = intrinsics
@@ -176,12 +179,12 @@ class DepthSensor:
         self._grown_m = np.empty(intrinsics.shape, dtype=np.float32)
 
     def measure(self, z_m: NDArray[np.float32], moment: int) -> NDArray[np.uint16]:
-        """Depth (H, W) uint16 in units of `depth_scale_m` of true depth `z_m` (H, W) float32 (inf: nothing).
+        """Measure true depth `z_m` (H, W) float32 (inf: none) as depth (H, W) uint16 in units of `depth_scale_m`.
 
-        `moment` is any integer that tells frames apart: equal moments of equally seeded sensors have equal noise.
+        `moment` is any integer that identifies the frame: equal moments of equally seeded sensors have equal noise.
         """
         noise, camera = self._noise, self._intrinsics
-        # Mixed twice, so that no moment of one seed is a moment of another.
+        # Mixed twice, so that no moment of one seed equals a moment of another.
         key = np.uint64(mix(np.uint64(mix(self._key ^ np.uint64(moment & _LOW_64)))))
         fill_gauss(self._noise_grid, key, self._gauss)
         smooth_field(self._noise_grid, noise.smooth_px, noise.smooth_px, self._smooth)
@@ -214,20 +217,20 @@ class DepthSensor:
 
 
 def _grid(height: int, width: int, rows_px: int, columns_px: int) -> NDArray[np.float32]:
-    """Room for the nodes of a field over an image."""
+    """Allocate the nodes of a field over an image."""
     return np.empty((height // rows_px + 2, width // columns_px + 2), dtype=np.float32)
 
 
 @cache
 def gauss_table() -> NDArray[np.float32]:
-    """Quantiles of the normal distribution: a random entry is a normal number."""
+    """Return quantiles of the normal distribution: a random entry is a normal number."""
     count = 1 << GAUSS_BITS
     return np.asarray(ndtri((np.arange(count) + 0.5) / count), dtype=np.float32)
 
 
 @kernel
 def mix(key: np.uint64) -> np.uint64:
-    """A 64-bit number in which each bit depends on all bits of `key` (splitmix64, Steele et al. 2014)."""
+    """Return a 64-bit number in which each bit depends on all bits of `key` (splitmix64, Steele et al. 2014)."""
     x = key + np.uint64(0x9E3779B97F4A7C15)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -236,7 +239,7 @@ def mix(key: np.uint64) -> np.uint64:
 
 @kernel
 def fill_gauss(grid: NDArray[np.float32], key: np.uint64, gauss: NDArray[np.float32]) -> None:
-    """Fill `grid` with independent normal numbers that depend on `key` alone."""
+    """Fill `grid` with independent normal numbers that depend only on `key`."""
     rows, columns = grid.shape
     for i in range(rows):
         for j in range(columns):
@@ -246,7 +249,7 @@ def fill_gauss(grid: NDArray[np.float32], key: np.uint64, gauss: NDArray[np.floa
 
 @kernel
 def smooth_field(grid: NDArray[np.float32], rows_px: int, columns_px: int, field: NDArray[np.float32]) -> None:
-    """Spread `grid`, nodes of unit variance, over `field` (H, W): linear between nodes, of unit variance everywhere."""
+    """Interpolate `grid`, nodes of unit variance, linearly over `field` (H, W), with unit variance everywhere."""
     height, width = field.shape
     columns = grid.shape[1]
     row = np.empty(columns, dtype=np.float32)
@@ -277,10 +280,10 @@ def grow_near(
     ragged: float,
     grown_m: NDArray[np.float32],
 ) -> None:
-    """Let near surfaces grow by `halo_px_m / z` pixels over what lies behind their edges, at their own depth.
+    """Grow near surfaces by `halo_px_m / z` pixels over the background at their edges, at their own depth.
 
-    `grown_m` (H, W) holds a copy of `z_m` on entry. At each pixel the width varies by `ragged` of itself for one unit
-    of `ragged_field` (H, W), at most two.
+    `grown_m` (H, W) holds a copy of `z_m` on entry. The width varies by the share `ragged` for each unit of
+    `ragged_field` (H, W), at most two.
     """
     height, width = z_m.shape
     for y in range(height):
@@ -314,9 +317,9 @@ def measure(
     faults: Faults,
     depth: NDArray[np.uint16],
 ) -> None:
-    """Measure what stands at `z_m` (H, W) float32 metres (inf: nothing) into `depth` (H, W).
+    """Measure the surfaces at `z_m` (H, W) float32 metres (inf: none) into `depth` (H, W).
 
-    `sigma_m` over depth in steps of `SIGMA_STEP_M`.
+    `sigma_m` is over depth in steps of `SIGMA_STEP_M`.
     """
     smooth, blobs, gauss, key = Chance(*chance)
     camera, faults = Camera(*camera), Faults(*faults)
@@ -327,7 +330,7 @@ def measure(
     sigma_last = len(sigma_m) - 1
     low16 = np.uint64(0xFFFF)
     for y in range(height):
-        # The leftmost column at which the right imager sees anything that lies to the right of here.
+        # The leftmost column of the right imager that shows any point to the right of here.
         leftmost = np.inf
         ray_y = (y - cy) / fy
         for x in range(width - 1, -1, -1):
@@ -390,10 +393,10 @@ def measure(
 
 @kernel
 def incidence_cos(z: float, sides: Sides, camera: Camera, ray_x: float, ray_y: float) -> float:
-    """Cosine between a pixel's ray (ray_x, ray_y, 1) and the normal of its surface, from depth differences.
+    """Return the cosine between a pixel's ray (ray_x, ray_y, 1) and the normal of its surface, from depth differences.
 
-    A plane's 1/z is linear on the screen, and its normal is that plane's gradient; so the differences may be taken
-    over the flatter side, one pixel wide.
+    A plane's 1/z is linear on the screen, and its gradient there gives the normal. So the differences are taken over
+    the flatter side, one pixel wide.
     """
     from_left, to_right, from_above, to_below = sides
     dx = from_left if abs(from_left) < abs(to_right) else to_right

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """RealSense cameras that can be plugged in and out, as file devices on the SDK's context.
 
-A file says which recordings are plugged in now, one path a line. This is the unit's capture process but for the
-socket into which they are plugged, so all that the unit does about a camera that comes and goes is done for real.
+A file lists the recordings that are plugged in, one path a line. Everything except the sockets is the unit's real
+capture process, so a unit's reaction to cameras that come and go is tested for real.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from edge_unit.sources.realsense.capture_process import main
 from edge_unit.sources.realsense.sdk import rs
 from shared.files import write_whole
 
-LOOK_EVERY_S = 0.02
+POLL_S = 0.02
 
 
 def command(sockets: Path) -> tuple[str, ...]:
-    """The capture command of a `RealsenseSource` whose cameras are those of the file `sockets`."""
+    """Return the capture command of a `RealsenseSource` whose cameras are those of the file `sockets`."""
     return sys.executable, "-m", "simulation.cameras.pluggable", str(sockets)
 
 
 def plug(sockets: Path, recordings: Iterable[Path]) -> None:
-    """From now on these recordings are plugged in, and no other."""
+    """Plug in these recordings, and unplug all others."""
     write_whole(sockets, "".join(f"{recording}\n" for recording in recordings).encode(), synced=False)
 
 
 class Sockets:
-    """What is plugged in, on a context."""
+    """The plugged-in devices of a context."""
 
     def __init__(self, sockets: Path, context: rs.context) -> None:
         self._sockets = sockets
@@ -42,24 +42,24 @@ class Sockets:
         self._plugged: dict[str, object] = {}
 
     def look(self) -> None:
-        """Plug in and out as the file says."""
+        """Plug and unplug devices according to the file."""
         wanted = self._sockets.read_text().split() if self._sockets.is_file() else []
         for path in self._plugged.keys() - set(wanted):
             self._context.unload_device(path)
             del self._plugged[path]
         for path in set(wanted) - self._plugged.keys():
-            # The SDK forgets a device that nobody holds.
+            # The SDK drops a device that has no reference.
             self._plugged[path] = self._context.load_device(path)
 
     def follow(self) -> None:
-        """Look for ever."""
+        """Poll the file for ever."""
         pause = threading.Event()
-        while not pause.wait(LOOK_EVERY_S):
+        while not pause.wait(POLL_S):
             self.look()
 
 
 def serve(end: socket.socket) -> None:
-    """Capture from whatever is plugged in; a camera does not end, so its recording begins again."""
+    """Capture from the plugged-in cameras; a recording starts again at its end, since a camera does not end."""
     received = link.receive(end)
     if received is None or not isinstance(received[0], link.Request):
         return

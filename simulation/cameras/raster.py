@@ -2,8 +2,8 @@
 """True depth, fast: a z-buffer of our own for meshes, and capsules by formula.
 
 Triangles are drawn in homogeneous coordinates (Olano and Greer, "Triangle Scan Conversion using 2D Homogeneous
-Coordinates", 1997): corners are projected without division, so that nothing need be clipped where a triangle
-crosses the camera's plane. The unit's own rasteriser works by another method, on purpose.
+Coordinates", 1997): corners are projected without division, so triangles that cross the camera's plane need no
+clipping. The unit's own rasterizer uses another method, on purpose.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from shared.transforms import Transform, inverse
 from simulation.world.scene import Body, Scene, View
 
 NEAR_M = 0.02
-"""Nothing nearer is drawn: it would be inside the camera's housing."""
+"""Least depth drawn: nearer points would be inside the camera's housing."""
 
 
 class Picture(NamedTuple):
-    """What is drawn: inverse depth `w` (H, W) float32 of 1/m, nothing nearer than `near_m`, and its `owner` (H, W)."""
+    """Buffers: inverse depth `w` (H, W) float32 in 1/m, nothing nearer than `near_m`, and its `owner` (H, W)."""
 
     w: NDArray[np.float32]
     owner: NDArray[np.uint8]
@@ -44,7 +44,7 @@ class Segments(NamedTuple):
 
 
 class RasterRenderer:
-    """Draws scenes as seen by one camera; what is fixed is drawn once."""
+    """Draw scenes for one camera; fixed bodies are drawn once."""
 
     def __init__(self, intrinsics: Intrinsics, T_world_camera: Transform) -> None:
         self._camera = camera_of(intrinsics)
@@ -101,7 +101,7 @@ def draw_mesh(
     corners: NDArray[np.float64],
     picture: Picture,
 ) -> None:
-    """Draw a mesh, from both sides.
+    """Draw a mesh from both sides.
 
     `vertices_m` (V, 3), `faces` (F, 3), `T_camera_mesh` (4, 4); `corners` (>= V, 3) is scratch.
     """
@@ -171,7 +171,7 @@ def draw_capsules(segments: Segments, camera: Camera, picture: Picture) -> None:
             continue
         left, right, top, bottom = 0, width - 1, 0, height - 1
         if nearest >= near_m:
-            # A sphere lies inside its box, and a box seen from in front projects farthest at its near or far face.
+            # A sphere is inside its box, and a box in front projects farthest at its near or far face.
             u_low = min((ax - r) / max(az - r, near_m), (ax - r) / (az + r))
             u_low = min(u_low, (bx - r) / max(bz - r, near_m), (bx - r) / (bz + r))
             u_high = max((ax + r) / max(az - r, near_m), (ax + r) / (az + r))
@@ -204,7 +204,7 @@ def draw_capsules(segments: Segments, camera: Camera, picture: Picture) -> None:
                     q = ss * da - ds * sa
                     under_root = q * q - p * (ss * (aa - r * r) - sa * sa)
                     if under_root < 0.0:
-                        # Off the endless cylinder a ray meets neither of the spheres inside it.
+                        # A ray beside the infinite cylinder meets neither of the spheres inside it.
                         continue
                     z = (q - math.sqrt(under_root)) / p
                     along = z * ds - sa
@@ -230,7 +230,7 @@ def draw_capsules(segments: Segments, camera: Camera, picture: Picture) -> None:
 
 @kernel
 def to_depth(w: NDArray[np.float32]) -> None:
-    """Turn inverse depth into depth in place: metres, inf where nothing stands."""
+    """Convert inverse depth into depth in place: metres, inf for pixels without a surface."""
     height, width = w.shape
     for y in range(height):
         for x in range(width):

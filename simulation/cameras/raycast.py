@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""True depth by casting a ray through each pixel centre with Embree: shares no code with any rasteriser.
+"""True depth by casting a ray through each pixel centre with Embree; it shares no code with any rasterizer.
 
-What is fixed is cast once. Of what moves each mesh keeps its own Embree scene in its own frame for good, and the
-rays of the pixels that its bounding box covers are brought into that frame: cheaper than building a scene a frame.
+Fixed bodies are cast once. Each mesh that moves keeps its own Embree scene in its own frame, and the rays of the pixels
+that its bounding box covers are transformed into that frame. That is cheaper than building a scene for each frame.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from shared.transforms import Transform, apply, inverse
 from simulation.world.scene import Body, Scene, View
 
 MAX_SCENES = 256
-"""Meshes kept ready for rays: a robot's links and the limbs of a dozen people; some 20 MB."""
+"""Limit of Embree scenes kept: a robot's links and the limbs of a dozen people; about 20 MB."""
 
 
 class RaycastRenderer:
-    """Casts the rays of one camera into scenes."""
+    """Cast the rays of one camera into scenes."""
 
     def __init__(self, intrinsics: Intrinsics, T_world_camera: Transform) -> None:
         self._intrinsics = intrinsics
@@ -53,7 +53,7 @@ class RaycastRenderer:
         return view
 
     def _cast(self, body: Body, view: View) -> None:
-        """Cast the rays that may meet `body`, and keep what is nearer than `view` has."""
+        """Cast the rays that may meet `body`, and keep hits nearer than those in `view`."""
         T_mesh_camera = inverse(body.T_world_mesh) @ self._T_world_camera
         area = self._area(body.mesh, inverse(T_mesh_camera))
         if area is None:
@@ -73,7 +73,7 @@ class RaycastRenderer:
         if found is None:
             scene = EmbreeScene()
             EmbreeMesh(scene, np.array(mesh.vertices), np.array(mesh.faces))
-            # The mesh is kept along, so that no other can take its id.
+            # A reference to the mesh is kept, so that no other can get its id.
             found = self._ready[id(mesh)] = (mesh, scene)
             if len(self._ready) > MAX_SCENES:
                 self._ready.popitem(last=False)
@@ -82,7 +82,7 @@ class RaycastRenderer:
         return found[1]
 
     def _area(self, mesh: TriangleMesh, T_camera_mesh: Transform) -> tuple[slice, slice] | None:
-        """Rows and columns that the mesh's bounding box covers; none when it is out of sight."""
+        """Return the rows and columns that the mesh's bounding box covers, or None if it is out of view."""
         corners = _box_corners(mesh)
         points = apply(T_camera_mesh, corners)
         if points[:, 2].max() <= 0.0:
@@ -99,10 +99,10 @@ class RaycastRenderer:
 
 
 _MISS_M = np.float32(1e6)
-"""Embree reports 1e37 where a ray meets nothing."""
+"""Distance above which a hit is a miss: Embree reports 1e37 for a ray without a hit."""
 
 _BEFORE_CAMERA_M = 1e-3
-"""A box that comes nearer than this, or lies partly behind the camera, may cover the whole picture."""
+"""A box nearer than this, or partly behind the camera, may cover the whole image."""
 
 
 def _box_corners(mesh: TriangleMesh) -> NDArray[np.float64]:

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which voxels should be reported, and which must not: what a frame's true depth says.
+"""Ground truth of a frame: voxels that should be reported, and voxels that must not.
 
-*Visible* is a voxel that shows at least `VISIBLE_SHARE` of the points that a square of its size facing the camera
-would show (`fx * fy * (size / z)²`, z the depth of its middle). *Outside* the margin it is when as many of these
-points are nearer than the limit of what is known there.
+A voxel is *visible* if it shows at least `VISIBLE_SHARE` of the points of a square of its size that faces the camera
+(`fx * fy * (size / z)²`, with z the depth of its centre). It is *outside* the margin if as many of these points are
+nearer than the limit of the known surfaces.
 
-*Surface* is every voxel that a true point of an unknown thing may be measured in: the point moved along its ray by up
-to `NOISE_SIGMAS` standard deviations of depth. A reported voxel is false when neither it nor one of its neighbours
-(26, or all within `reach` voxels) is surface.
+*Surface* is every voxel in which a true point of an unknown object may be measured: the point moved along its ray by up
+to `NOISE_SIGMAS` standard deviations of depth. A reported voxel is false if neither it nor one of its neighbours (26,
+or all within `reach` voxels) is surface.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ from simulation.cameras.depth_noise import DepthNoise
 from simulation.world.scene import FIRST_UNKNOWN, View
 
 VISIBLE_SHARE = 0.1
-"""A tenth of the pinhole count: less is a sliver at the rim of a thing, or one seen at a grazing angle."""
+"""Least share of the pinhole count: fewer points are a sliver at the rim of an object, or a grazing angle."""
 
 NOISE_SIGMAS = 3.0
-"""One point in 370 is measured farther off than this."""
+"""Limit of noise in standard deviations: one point in 370 is measured farther off."""
 
 SIGMA_STEP_M = 0.05
-"""Steps in depth of the table of tolerances: within one, noise grows by a few per cent."""
+"""Step in depth of the table of tolerances; within one step, noise grows by a few per cent."""
 
 MAX_DEPTH_M = 20.0
-"""The table's end; no cell is that deep."""
+"""End of the table; no cell is that deep."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameTruth:
-    """What one camera could have reported of one moment.
+    """Voxels that one camera could have reported at one moment.
 
     Attributes:
-        visible_keys: (N,) uint32 ascending, voxels with enough true points of unknown things.
-        visible_counts: (N,) uint32, how many points.
-        outside: (N,) bool, those with enough points outside the margin of what is known.
+        visible_keys: (N,) uint32 ascending, voxels with enough true points of unknown objects.
+        visible_counts: (N,) uint32, their numbers of points.
+        outside: (N,) bool, True for those with enough points outside the margin of known surfaces.
         surface_keys: (M,) uint32 ascending, voxels in which such a point may be measured.
     """
 
@@ -64,12 +64,12 @@ class FrameTruth:
 
     @property
     def margin_keys(self) -> NDArray[np.uint32]:
-        """Visible voxels that stand so close before something known that they need not be reported."""
+        """Visible voxels so close before a known surface that they need not be reported."""
         return self.visible_keys[~self.outside]
 
 
 class Grid(NamedTuple):
-    """The lattice: where it begins, (3,), its voxels' size and its shape (3,)."""
+    """The lattice: its origin (3,), voxel size and shape (3,)."""
 
     origin_m: NDArray[np.float64]
     voxel_size_m: float
@@ -77,8 +77,8 @@ class Grid(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Keys of the voxels of all unknown pixels, of those outside the margin, and, each once, of those that such a
-    pixel's point may be measured in. `marked` (cells,) is scratch, all false before and after.
+    """Keys of the voxels of all unknown pixels, of those outside the margin, and of those in which such points may be
+    measured, each once. `marked` (cells,) is scratch, all False before and after.
     """
 
     inside: NDArray[np.uint32]
@@ -88,7 +88,7 @@ class Found(NamedTuple):
 
 
 class TruthFinder:
-    """Finds the truth of one camera's frames on one lattice."""
+    """Compute the ground truth of one camera's frames on one lattice."""
 
     def __init__(self, intrinsics: Intrinsics, T_world_camera: Transform, lattice: Lattice, noise: DepthNoise) -> None:
         self._intrinsics = intrinsics
@@ -104,10 +104,10 @@ class TruthFinder:
         self._surface = np.empty(lattice.cell_count, dtype=np.uint32)
 
     def find(self, view: View, limit_m: NDArray[np.float32] | None = None) -> FrameTruth:
-        """The truth of what a perfect camera sees.
+        """Return the ground truth for the view of a perfect camera.
 
-        `limit_m` (H, W) float32: a pixel is outside the margin when its true depth is below it (inf: nothing known
-        there); None when all are.
+        `limit_m` (H, W) float32: a pixel is outside the margin if its true depth is below it (inf: no known surface).
+        None: all pixels are outside.
         """
         lattice = self._lattice
         limits = np.full((1, 1), np.inf, dtype=np.float32) if limit_m is None else limit_m
@@ -135,7 +135,7 @@ class TruthFinder:
         )
 
     def _enough(self, keys: NDArray[np.uint32]) -> NDArray[np.float64]:
-        """How many points make each voxel visible."""
+        """Return the number of points that makes each voxel visible."""
         centres_m = self._lattice.centres(self._lattice.indices(keys))
         z_m = np.maximum(centres_m @ self._view_axis[:3] + self._view_axis[3], 1e-3)
         full = self._intrinsics.fx * self._intrinsics.fy * (self._lattice.voxel_size_m / z_m) ** 2
@@ -145,9 +145,9 @@ class TruthFinder:
 def false_voxels(
     reported: NDArray[np.uint32], surface: NDArray[np.uint32], lattice: Lattice, reach: int = 1
 ) -> NDArray[np.uint32]:
-    """Those of the `reported` keys (N,) that have no `surface` key (M,) within `reach` voxels along each axis.
+    """Return the `reported` keys (N,) without a `surface` key (M,) within `reach` voxels along each axis.
 
-    Of several cameras, `surface` holds the keys of all of them, in any order.
+    For several cameras, `surface` contains the keys of all of them, in any order.
     """
     return reported[~has_near(reported, surface, lattice, reach)]
 
@@ -155,15 +155,15 @@ def false_voxels(
 def missed_voxels(
     visible: NDArray[np.uint32], reported: NDArray[np.uint32], lattice: Lattice, reach: int = 1
 ) -> NDArray[np.uint32]:
-    """Those of the `visible` keys (N,) that have no `reported` key (M,) within `reach` voxels along each axis.
+    """Return the `visible` keys (N,) without a `reported` key (M,) within `reach` voxels along each axis.
 
-    At `reach` 0 a point that noise moved over a voxel's border counts as missed.
+    With `reach` 0, a point that noise moved over a voxel's border counts as missed.
     """
     return visible[~has_near(visible, reported, lattice, reach)]
 
 
 def has_near(keys: NDArray[np.uint32], others: NDArray[np.uint32], lattice: Lattice, reach: int) -> NDArray[np.bool_]:
-    """For each of `keys` (N,) whether one of `others` (M,) lies within `reach` voxels along each axis."""
+    """Return (N,) bool: True for `keys` (N,) with one of `others` (M,) within `reach` voxels along each axis."""
     found = np.empty(len(keys), dtype=np.bool_)
     near_keys(keys, others, np.array(lattice.shape), reach, np.zeros(lattice.cell_count, dtype=np.bool_), found)
     return found
@@ -181,10 +181,10 @@ def find_keys(
     grid: Grid,
     found: Found,
 ) -> tuple[int, int, int]:
-    """Find what the unknown pixels of a view may be reported as; returns how many keys of each kind are `found`.
+    """Find the voxels in which the unknown pixels of a view may be reported; return the numbers of keys `found`.
 
-    Outside the margin is what is nearer than `limit_m` ((H, W), or (1, 1) for all). `tolerance_m` over depth in steps
-    of `SIGMA_STEP_M`.
+    Points nearer than `limit_m` ((H, W), or (1, 1) for all) are outside the margin. `tolerance_m` is over depth in
+    steps of `SIGMA_STEP_M`.
     """
     fx, fy, cx, cy, width, height = Camera(*camera)
     origin_m, voxel_size_m, shape = Grid(*grid)
@@ -193,7 +193,7 @@ def find_keys(
     scale = 1.0 / voxel_size_m
     last = len(tolerance_m) - 1
     count, outside, touched = 0, 0, 0
-    # In voxels: where all rays start, and below how far each goes per metre of depth.
+    # In voxels: the origin of all rays, and below it the step of each for a metre of depth.
     ax = (t[0, 3] - origin_m[0]) * scale
     ay = (t[1, 3] - origin_m[1]) * scale
     az = (t[2, 3] - origin_m[2]) * scale
@@ -214,7 +214,7 @@ def find_keys(
                     beyond_margin[outside] = key
                     outside += 1
             tolerance = tolerance_m[min(int(z / SIGMA_STEP_M) + 1, last)]
-            # Half a voxel a step: what a step passes over is a neighbour of what it meets.
+            # Half a voxel a step: a skipped voxel is a neighbour of a found one.
             steps = int(np.ceil(tolerance * 2.0 * scale))
             for k in range(-steps, steps + 1):
                 here = z + tolerance * k / max(steps, 1)
@@ -230,7 +230,7 @@ def find_keys(
 
 @kernel
 def voxel_key(ix: float, iy: float, iz: float, shape: NDArray[np.int64]) -> int:
-    """The key of a position in voxels; -1 outside the lattice."""
+    """Return the key of a position in voxels; -1 outside the lattice."""
     jx, jy, jz = int(np.floor(ix)), int(np.floor(iy)), int(np.floor(iz))
     if jx < 0 or jy < 0 or jz < 0 or jx >= shape[0] or jy >= shape[1] or jz >= shape[2]:
         return -1
@@ -246,9 +246,9 @@ def near_keys(
     marked: NDArray[np.bool_],
     found: NDArray[np.bool_],
 ) -> None:
-    """Set `found` (N,) where one of `others` (M,) lies within `reach` voxels of one of `keys` (N,).
+    """Set `found` (N,) for `keys` (N,) with one of `others` (M,) within `reach` voxels.
 
-    `marked` (cells,) is scratch, all false before.
+    `marked` (cells,) is scratch, all False before.
     """
     nx, ny, nz = shape[0], shape[1], shape[2]
     for i in range(len(others)):

@@ -3,9 +3,9 @@
 
 In the order of the flow:
 
-    table            the demo's live table
+    table            the live table of the demo
     show             the demo itself
-    picture          the README's picture
+    picture          the README's picture of the method
     window_pictures  the README's pictures of the operator's window
     __main__         the command line
 """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make demo`: a master, several units and a robot's controller as real processes, and people who walk about.
+"""`make demo`: a master, several units and a robot's controller as real processes, with walking people.
 
-Cameras, robot and people are simulated; all else is what runs in a real cell.
+Cameras, robot and people are simulated; everything else is the software of a real cell.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from collections.abc import Sequence
 from simulation.fleet.processes import die_with_parent, raise_when_stopped
 
 EXIT_STOPPED = 130
-"""What shells call an end by Ctrl-C."""
+"""Exit code of shells after Ctrl-C."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demo; exit code 1 when something failed, 130 when stopped before its time."""
     if "MAKELEVEL" in os.environ:
-        # When make is killed, nobody is left to stop this.
+        # If make is killed, nobody else stops this process.
         die_with_parent(signal.SIGTERM)
     raise_when_stopped()
     try:
-        # Takes a second or two, in which a Ctrl-C should end it as quietly as later.
+        # The import takes a second or two; a Ctrl-C during it must end the process as quietly as later.
         from simulation.demo.show import run
 
         return run(arguments)

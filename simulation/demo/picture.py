@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The README's picture: what one camera of the demo cell looks at, and what the units make of it together.
+"""The README's picture: the view of one camera of the demo cell, and the merged map of all units.
 
-`python -m simulation.demo.picture FILE.png`. Painted here from our own renderer's depth, so that nothing need be
-installed.
+`python -m simulation.demo.picture FILE.png`. It is painted from the depth of our own renderer, so that no graphics
+library is required.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from simulation.world.scene import Body, Capsules, Owner, Scene, View
 from simulation.world.world import World
 
 WIDTH, HEIGHT = 640, 480
-"""Of each half, in pixels."""
+"""Size of each half, in pixels."""
 
 OVERSAMPLING = 2
-"""Painted so much larger and averaged: edges are smooth."""
+"""Factor by which it is painted larger and then averaged, for smooth edges."""
 
 MOMENT_S = 69.4
-"""The person leans over the table's end, beside the robot."""
+"""At this moment the person leans over the table's end, beside the robot."""
 
 BYTES_MAX = 300_000
-"""A README is read over slow lines too."""
+"""Limit of the file; a README is also read over slow lines."""
 
 GAP_PX = 10
 
-# Blue, green, red, as OpenCV has them.
+# Blue, green, red, as in OpenCV.
 PAPER = (250, 248, 246)
 INK = np.array((60, 52, 46))
 COLOURS = {
@@ -53,27 +53,27 @@ COLOURS = {
     Owner.UNKNOWN: (64, 126, 240),
 }
 WITNESS_COLOURS = ((150, 196, 250), (96, 160, 246), (48, 116, 236), (24, 78, 204))
-"""Of a voxel that one unit reports, two, three, four and more."""
+"""Colours of a voxel that one, two, three, four or more units report."""
 
 LIGHT = np.array((0.45, 0.35, 0.8))
-"""Towards the light, world."""
+"""Direction towards the light, world frame."""
 
 FLOOR_GRID_M = 0.5
 TEXT_SCALE = 0.55
-"""Of OpenCV's letters, before oversampling."""
+"""Scale of OpenCV's letters, before averaging."""
 
 CUBE_CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 CUBE_FACES = np.array(
     [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
      (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
 )  # fmt: skip
-"""Of the corners above, anticlockwise from outside."""
+"""Indices of the corners above, counter-clockwise from outside."""
 
 Colours: TypeAlias = NDArray[np.float64]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Paint it; exit code 1 when it would be too large a file."""
+    """Paint the picture; exit code 1 if the file would be too large."""
     parser = argparse.ArgumentParser(
         prog="python -m simulation.demo.picture", description=(__doc__ or "").split("\n")[0]
     )
@@ -89,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def picture() -> NDArray[np.uint8]:
-    """Both halves, (H, W, 3) uint8."""
+    """Return both halves, (H, W, 3) uint8."""
     world = replace(World.demo(), room=())
     poses = rig(world.cell)
     lattice, keys, witnesses = merged_map(world, MOMENT_S)
@@ -108,7 +108,7 @@ def picture() -> NDArray[np.uint8]:
 
 
 def merged_map(world: World, t_s: float) -> tuple[Lattice, NDArray[np.uint32], NDArray[np.int64]]:
-    """What four units report of one moment: keys (N,) on the lattice, and how many of them report each."""
+    """Return the units' merged map of one moment: keys (N,) on the lattice, and the number of units for each."""
     intrinsics = d435i_intrinsics(424, 240)
     reports = []
     for index, pose in enumerate(rig(world.cell)):
@@ -120,7 +120,7 @@ def merged_map(world: World, t_s: float) -> tuple[Lattice, NDArray[np.uint32], N
 
 
 class Painter:
-    """Paints scenes as seen from one pose."""
+    """Paint scenes as seen from one pose."""
 
     def __init__(self, intrinsics: Intrinsics, T_world_camera: Transform) -> None:
         self._intrinsics = intrinsics
@@ -131,34 +131,34 @@ class Painter:
         self._rays = np.stack((across, down, np.ones(intrinsics.shape)), axis=-1)
 
     def paint(self, scene: Scene) -> Colours:
-        """A scene as it is."""
+        """Paint a scene."""
         view = self._renderer.render(scene)
         return self._shade(view, self._base(view))
 
     def paint_voxels(
         self, scene: Scene, lattice: Lattice, keys: NDArray[np.uint32], witnesses: NDArray[np.int64]
     ) -> Colours:
-        """A scene with the voxels of a map in the place of its people."""
+        """Paint a scene with the voxels of a map instead of its people."""
         cubes = Body("map", voxel_mesh(lattice, keys), np.eye(4), Owner.UNKNOWN)
         view = self._renderer.render(Scene(scene.fixed, (*scene.moving, cubes), Capsules.joined([])))
         base = self._base(view)
         points, normals = self._points(view), self._normals(view)
         voxel = view.owner == Owner.UNKNOWN
-        # Just below the surface, to be safely inside.
+        # Just below the surface, to be surely inside.
         inside = (points - 0.1 * lattice.voxel_size_m * normals)[voxel]
         found = np.searchsorted(keys, lattice.keys(lattice.index(inside)))
         count = witnesses[np.minimum(found, len(keys) - 1)]
         base[voxel] = np.array(WITNESS_COLOURS)[np.minimum(count, len(WITNESS_COLOURS)) - 1]
         shares = (inside - lattice.origin_m) / lattice.voxel_size_m % 1.0
         to_border = np.minimum(shares, 1.0 - shares)
-        # Across the face lies one border for all its pixels; the nearer of the other two makes the line.
+        # Across the face, the border is the same for all its pixels; the nearer of the other two is the line.
         to_border[np.arange(len(inside)), np.abs(normals[voxel]).argmax(axis=-1)] = 1.0
         line = to_border.min(axis=-1) * lattice.voxel_size_m < view.z_m[voxel] / self._intrinsics.fx
         base[voxel] = np.where(line[:, None], 0.72 * base[voxel], base[voxel])
         return self._shade(view, base)
 
     def finish(self, colours: Colours, caption: str) -> NDArray[np.uint8]:
-        """Averaged down to (HEIGHT, WIDTH, 3) uint8, with a caption."""
+        """Average down to (HEIGHT, WIDTH, 3) uint8, and add a caption."""
         image = np.clip(colours, 0.0, 255.0).astype(np.uint8)
         origin = (14 * OVERSAMPLING, 26 * OVERSAMPLING)
         cv2.putText(
@@ -168,7 +168,7 @@ class Painter:
         return np.asarray(cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), np.uint8)
 
     def _base(self, view: View) -> Colours:
-        """Colours (H, W, 3) by owner, with a grid on the floor."""
+        """Return colours (H, W, 3) by owner, with a grid on the floor."""
         base = np.empty((*view.owner.shape, 3))
         base[:] = PAPER
         for owner, colour in COLOURS.items():
@@ -182,7 +182,7 @@ class Painter:
         return base
 
     def _shade(self, view: View, base: Colours) -> Colours:
-        """Light from one side, and ink where one thing ends before another."""
+        """Add light from one side, and lines where one object ends before another."""
         normals = self._normals(view)
         light = LIGHT / np.linalg.norm(LIGHT)
         brightness = 0.62 + 0.38 * np.clip(normals @ light, -0.4, 1.0)
@@ -192,7 +192,7 @@ class Painter:
         return painted
 
     def _edges(self, view: View) -> NDArray[np.bool_]:
-        """Pixels (H, W) beside which another surface begins."""
+        """Return the pixels (H, W) beside which another surface begins."""
         z = np.where(np.isfinite(view.z_m), view.z_m, 100.0)
         edges = np.zeros(z.shape, np.bool_)
         for axis in (0, 1):
@@ -205,12 +205,12 @@ class Painter:
         return edges
 
     def _points(self, view: View) -> NDArray[np.float64]:
-        """World points (H, W, 3)."""
+        """Return world points (H, W, 3)."""
         z = np.where(np.isfinite(view.z_m), view.z_m, 0.0)
         return apply(self._T_world_camera, self._rays * z[..., None])
 
     def _normals(self, view: View) -> NDArray[np.float64]:
-        """Normals (H, W, 3) in the world, from the flatter side of each pixel."""
+        """Return normals (H, W, 3) in the world frame, from the flatter side of each pixel."""
         camera = self._intrinsics
         z = np.where(np.isfinite(view.z_m), view.z_m, 100.0).astype(np.float64)
         # 1/z is linear on the screen: its gradient is the plane's normal.
@@ -228,7 +228,7 @@ class Painter:
 
 
 def voxel_mesh(lattice: Lattice, keys: NDArray[np.uint32]) -> TriangleMesh:
-    """A cube for each key."""
+    """Return a mesh with a cube for each key."""
     corners = lattice.indices(keys).astype(np.float64)[:, None] + CUBE_CORNERS
     faces = CUBE_FACES + len(CUBE_CORNERS) * np.arange(len(keys))[:, None, None]
     vertices_m = lattice.origin_m + lattice.voxel_size_m * corners.reshape(-1, 3)
@@ -236,7 +236,7 @@ def voxel_mesh(lattice: Lattice, keys: NDArray[np.uint32]) -> TriangleMesh:
 
 
 def _intrinsics(focal_share: float) -> Intrinsics:
-    """Of one half; `focal_share` is the focal length in parts of the width."""
+    """Return the intrinsics of one half; `focal_share` is the focal length as a share of the width."""
     width, height = WIDTH * OVERSAMPLING, HEIGHT * OVERSAMPLING
     focal_px = focal_share * width
     return Intrinsics(width, height, focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1))

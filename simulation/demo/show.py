@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo itself: a fleet that is watched live, and what it reported held against what was there."""
+"""The demo: a fleet with a live table, and a comparison of its reports with the ground truth."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ from simulation.fleet.processes import STOP_SIGNALS, raise_when_stopped
 from simulation.world.world import MAX_DEMO_PEOPLE
 
 START_S = 120.0
-"""For all units to be live, on a slow and busy machine; compiling is not counted."""
+"""Timeout for all units to be live, on a slow and busy machine, without the time for compilation."""
 
 SETTLE_S = 2.0
-"""From the moment at which all units are live until frames count."""
+"""Delay between the moment when all units are live and the first frame that counts."""
 
 DRAIN_S = 0.3
-"""After the last frame that counts, for it to be merged."""
+"""Delay after the last frame that counts, until it is merged."""
 
 REFRESH_S = 0.5
-"""Between two drawings of the table. The list of unseen blocks that it asks for is long."""
+"""Period of the table. It requests the list of unseen blocks, which is long."""
 
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
-"""Variables of which one is set where a browser has somewhere to open."""
+"""Variables of which one is set if a browser can open."""
 
 RESOLUTIONS = ", ".join(f"{width}x{height}" for width, height in D435I_FOCAL_PX)
 
@@ -53,12 +53,12 @@ FRAME_RATE_SHARE_MIN = 14.0 / 15.0
 CAPTURE_TO_MAP_MS_MAX = 66.0
 FALSE_FRAME_FRACTION_MAX = 0.005
 MISSED_FRACTION_MAX = 0.02
-"""What a quiet machine with two cores keeps to."""
+"""Marks that a quiet machine with two cores meets."""
 
 
 @dataclass
 class Outcome:
-    """How a run ended: the time whose frames count, once it is known; if someone stopped it; what went wrong."""
+    """Outcome of a run: the period whose frames count, once known; whether a person stopped it; failures."""
 
     begin_ns: int | None = None
     end_ns: int | None = None
@@ -67,10 +67,10 @@ class Outcome:
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run the demo; exit code 1 when something failed.
+    """Run the demo; exit code 1 if something failed.
 
     Raises:
-        KeyboardInterrupt: it was stopped before its time.
+        KeyboardInterrupt: a person stopped it before its end.
     """
     options = _parse(arguments)
     screen = Screen(sys.stderr if options.json else sys.stdout)
@@ -78,7 +78,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         with _folder(options.folder) as folder:
             fleet = Fleet(_fleet_options(options), folder)
             outcome = asyncio.run(_run(fleet, options.seconds, screen, not options.no_browser and not options.json))
-            # The event loop took the handlers with it.
+            # The event loop removed its handlers when it closed.
             raise_when_stopped()
             screen.leave()
             for failure in outcome.failures:
@@ -98,13 +98,13 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 
 async def _run(fleet: Fleet, seconds: float | None, screen: Screen, may_open: bool) -> Outcome:
-    """Start everything, watch it until its time is over or someone stops it, stop everything."""
+    """Start everything, show it until its end or a stop, then stop everything."""
     loop, task = asyncio.get_running_loop(), asyncio.current_task()
     assert task is not None
 
     def stop() -> None:
         for number in STOP_SIGNALS:
-            # A second one must not interrupt the stopping.
+            # A second signal must not interrupt the stop.
             loop.add_signal_handler(number, int)
         task.cancel()
 
@@ -124,7 +124,7 @@ async def _run(fleet: Fleet, seconds: float | None, screen: Screen, may_open: bo
 
 
 async def _start(fleet: Fleet, screen: Screen, power: PowerSwitch, may_open: bool) -> None:
-    """Start the fleet; the first thing that is said is where to find it, the second where to see it."""
+    """Start the fleet; print the address first, and then the link to the viewer."""
     await fleet.start_master(power.actions)
     screen.say(f"Cellwatch demo: {fleet.url} (try: curl {fleet.url}/voxels; Ctrl-C stops)")
     if link := await fleet.viewer_link():
@@ -143,7 +143,7 @@ async def _start(fleet: Fleet, screen: Screen, power: PowerSwitch, may_open: boo
 
 
 async def _watch(fleet: Fleet, seconds: float | None, screen: Screen, outcome: Outcome) -> None:
-    """Show how it goes, until the end of the time whose frames count; for ever when there is none."""
+    """Show the state until the end of the frames that count, or for ever if there is none."""
     started_ns = monotonic_ns()
     async with _Observer(fleet) as observer:
         while not fleet.master.failed:
@@ -166,7 +166,7 @@ async def _watch(fleet: Fleet, seconds: float | None, screen: Screen, outcome: O
 
 
 class _Observer:
-    """Asks the master how it goes, as anyone may."""
+    """Poll the master over its public interface."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
@@ -179,14 +179,14 @@ class _Observer:
         await self._client.aclose()
 
     async def look(self) -> tuple[list[UnitLine], MapLine | None]:
-        """All units and the merged map; without figures when nobody answers."""
+        """Return all units and the merged map; without figures if the master does not answer."""
         rows: dict[str, UnitRow] = {}
         try:
             rows = {row.ip: row for row in map(UnitRow.model_validate, await self._get("/units"))}
             voxels = await self._get("/voxels?form=keys&unseen=true")
             merged = _map_line(voxels)
         except httpx.HTTPError:
-            # What it says is that nothing is known; a master that is gone for good ends the demo.
+            # No answer means that nothing is known; a master that has failed ends the demo.
             merged = None
         return [_line(unit, rows.get(unit.address)) for unit in self._fleet.units], merged
 
@@ -214,7 +214,7 @@ def _map_line(voxels: dict[str, Any]) -> MapLine:
 
 
 def _figures(fleet: Fleet, seconds: float | None, outcome: Outcome, screen: Screen) -> dict[str, Any]:
-    """What is printed at the end of a run of limited time."""
+    """Return the figures printed at the end of a run of limited time."""
     options = fleet.options
     figures: dict[str, Any] = {
         "units": options.units,
@@ -245,7 +245,7 @@ def _marks_missed(figures: dict[str, Any], fps: float) -> list[str]:
 
 @contextmanager
 def _folder(wanted: Path | None) -> Iterator[Path]:
-    """Where everything is kept: `wanted`, which stays, or else a temporary one."""
+    """Create the folder for all files: `wanted`, which stays, or else a temporary one."""
     if wanted is None:
         with tempfile.TemporaryDirectory(prefix="cellwatch-demo-") as folder:
             yield Path(folder)
@@ -253,7 +253,7 @@ def _folder(wanted: Path | None) -> Iterator[Path]:
     try:
         wanted.mkdir(parents=True, exist_ok=True)
         if any(wanted.iterdir()):
-            raise ConfigError(f"--folder {wanted}: expected an empty folder, or none")
+            raise ConfigError(f"--folder {wanted}: expected an empty folder or a new one, got one with files")
     except OSError as error:
         raise ConfigError(f"--folder {wanted}: {error.strerror}") from error
     yield wanted.resolve()
@@ -279,43 +279,65 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         prog="make demo",
         description="A simulated cell: a master, units with a depth camera each and a robot's controller run as real "
         "processes on this machine; a UR3e moves over a table, and people walk beside it.",
-        epilog='Options go through ARGS, as in: make demo ARGS="--seconds 20 --json". With --seconds, what was '
-        "reported is held against what was there. frames_with_false_voxels: frames with a voxel where nothing "
-        "unknown stands within a voxel's distance. missed_fraction: of the people's voxels that a camera sees outside "
-        "the margins of what is known, how many the merged map holds neither themselves nor beside them; "
-        "missed_fraction_strict: not themselves. margin_fraction: how many are inside the margins.",
+        epilog='Pass options in ARGS: make demo ARGS="--seconds 20 --json". With --seconds, the reports are compared '
+        "with the ground truth. frames_with_false_voxels: frames with a voxel farther than one voxel from all "
+        "unknown objects. missed_fraction: of the people's voxels that a camera sees outside "
+        "the margins of known surfaces, the share absent from the merged map with all their neighbours; "
+        "missed_fraction_strict: the share absent themselves. margin_fraction: the share inside the margins.",
     )
     add = parser.add_argument
     add(
         "--seconds",
         type=_number(1.0, 600.0),
         metavar="S",
-        help="let the frames of S seconds count, then end and tell (default: run until stopped)",
+        help="count the frames of S seconds, then stop and print the figures (default: run until stopped)",
     )
-    add("--json", action="store_true", help="the figures as one line of JSON, all else on stderr (needs --seconds)")
-    add("--no-browser", action="store_true", help="open nothing")
+    add(
+        "--json",
+        action="store_true",
+        help="print the figures as one line of JSON, and all else on stderr (needs --seconds)",
+    )
+    add("--no-browser", action="store_true", help="do not open a browser")
     add("--units", type=_count(1, MAX_RIG), default=4, metavar="N", help="cameras, each with a unit (default: 4)")
-    add("--people", type=_count(0, MAX_DEMO_PEOPLE), default=1, metavar="N", help="who walk about (default: 1)")
+    add(
+        "--people",
+        type=_count(0, MAX_DEMO_PEOPLE),
+        default=1,
+        metavar="N",
+        help="number of walking people (default: 1)",
+    )
     add(
         "--resolution",
         type=_resolution,
         default=(424, 240),
         metavar="WxH",
-        help=f"of the cameras: {RESOLUTIONS} (default: 424x240)",
+        help=f"resolution of the cameras: {RESOLUTIONS} (default: 424x240)",
     )
-    add("--fps", type=_number(1.0, 90.0), default=15.0, metavar="F", help="of the cameras (default: 15)")
-    add("--voxel-size", type=_number(0.01, 0.10), default=0.05, metavar="M", help="in metres (default: 0.05)")
-    add("--seed", type=_count(0, 0xFFFF), default=0, metavar="N", help="decides who walks how, and noise (default: 0)")
-    add("--port", type=_count(0, 65535), default=0, metavar="P", help="of the master (default: one that is free)")
+    add("--fps", type=_number(1.0, 90.0), default=15.0, metavar="F", help="frame rate of the cameras (default: 15)")
+    add(
+        "--voxel-size",
+        type=_number(0.01, 0.10),
+        default=0.05,
+        metavar="M",
+        help="edge of a voxel in metres (default: 0.05)",
+    )
+    add(
+        "--seed",
+        type=_count(0, 0xFFFF),
+        default=0,
+        metavar="N",
+        help="seed of people's motion and of noise (default: 0)",
+    )
+    add("--port", type=_count(0, 65535), default=0, metavar="P", help="port of the master (default: a free one)")
     add("--folder", type=Path, metavar="DIR", help="keep configurations, logs and records there (default: deleted)")
     options = parser.parse_args(arguments)
     if options.json and options.seconds is None:
-        parser.error("--json: expected --seconds with it, for figures need an end")
+        parser.error("--json: expected --seconds too, since the figures are of a limited time")
     return options
 
 
 def _number(low: float, high: float) -> Callable[[str], float]:
-    """Numbers from `low` to `high`."""
+    """Return a parser of numbers from `low` to `high`."""
 
     def number(text: str) -> float:
         value = float(text)
@@ -327,7 +349,7 @@ def _number(low: float, high: float) -> Callable[[str], float]:
 
 
 def _count(low: int, high: int) -> Callable[[str], int]:
-    """Whole numbers from `low` to `high`."""
+    """Return a parser of whole numbers from `low` to `high`."""
 
     def count(text: str) -> int:
         value = int(text)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo's live table: drawn anew in place on a terminal, a plain line now and then elsewhere."""
+"""The live table of the demo: redrawn in place on a terminal, one plain line at intervals elsewhere."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TextIO
 from shared.clock import NS_PER_S
 
 LINE_EVERY_S = 5.0
-"""Without a terminal: often enough to see that it lives, rarely enough for a log."""
+"""Period of lines without a terminal: often enough to show that the demo runs, rarely enough for a log."""
 
 CLEAR_BELOW = "\x1b[J"
 UP = "\x1b[{}A\r"
@@ -19,7 +19,7 @@ UP = "\x1b[{}A\r"
 
 @dataclass(frozen=True)
 class UnitLine:
-    """One unit as the table shows it; figures are None while there are none."""
+    """One unit's row of the table; figures are None if not known."""
 
     name: str
     address: str
@@ -33,7 +33,7 @@ class UnitLine:
 
 @dataclass(frozen=True)
 class MapLine:
-    """The merged map as the table shows it."""
+    """The merged map's row of the table."""
 
     voxels: int
     seen_share: float
@@ -42,7 +42,7 @@ class MapLine:
 
 
 def table(units: Sequence[UnitLine], merged: MapLine | None) -> list[str]:
-    """The lines of the table."""
+    """Return the lines of the table."""
     lines = [f"{'unit':<8}{'address':<14}{'state':<14}{'fps':>6}{'voxels':>9}{'ms/frame':>10}{'age ms':>8}"]
     for unit in units:
         lines.append(
@@ -56,14 +56,14 @@ def table(units: Sequence[UnitLine], merged: MapLine | None) -> list[str]:
 
 
 def summary(units: Sequence[UnitLine], merged: MapLine | None) -> str:
-    """The table in one line."""
+    """Return the table in one line."""
     live = sum(unit.state == "live" for unit in units)
     fps = " ".join(_number(unit.fps, 1) for unit in units)
     return f"{live} of {len(units)} units live, fps {fps}; merged: {_merged(merged)}"
 
 
 class Screen:
-    """Where the demo talks to a person."""
+    """Output of the demo for a person."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -72,11 +72,11 @@ class Screen:
         self._last_line_ns: int | None = None
 
     def say(self, text: str) -> None:
-        """A line that stays, above the table."""
+        """Print a line that stays, above the table."""
         self._write(f"{self._erase()}{text}\n")
 
     def show(self, units: Sequence[UnitLine], merged: MapLine | None, now_ns: int) -> None:
-        """The state at `now_ns`."""
+        """Draw the state at `now_ns`."""
         if self._terminal:
             width = shutil.get_terminal_size().columns
             lines = [line[:width] for line in table(units, merged)]
@@ -88,11 +88,11 @@ class Screen:
             self._write(f"{summary(units, merged)}\n")
 
     def leave(self) -> None:
-        """The table stays as it is; what is said from now on stands below."""
+        """Leave the table as it is; print further lines below it."""
         self._drawn = 0
 
     def _erase(self) -> str:
-        """Takes the table off the terminal."""
+        """Return the control sequence that erases the table."""
         drawn, self._drawn = self._drawn, 0
         return UP.format(drawn) + CLEAR_BELOW if drawn else ""
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The README's pictures of the operator's window: the demo as a browser shows it, still and moving.
+"""The README's pictures of the operator's window: the demo in a browser, as a still and as a moving picture.
 
 `python -m simulation.demo.window_pictures FOLDER` writes `viewer.png` and `viewer.gif`; needs Debian's chromium.
 """
@@ -26,30 +26,30 @@ WIDTH, HEIGHT = 1280, 800
 GIF_WIDTH, GIF_HEIGHT = 720, 450
 
 FRAMES, CUT_AT = 18, 7
-"""Of the moving picture, and the one after which a unit loses its power."""
+"""Number of frames of the moving picture, and the frame after which a unit loses its power."""
 
 STILL_AT = 3
-"""The one that is kept as a still picture; at first all of it fades in."""
+"""Index of the still picture; in earlier frames everything still fades in."""
 
 FRAME_MS = 450
-"""Each is shown so long; without a graphics card one is painted in about this time, too."""
+"""Duration of each frame; without a graphics card, painting one takes about this time, too."""
 
 COLOURS = 128
 
 PNG_BYTES_MAX, GIF_BYTES_MAX = 400_000, 1_500_000
-"""A README is read over slow lines too."""
+"""Limits of the files; a README is also read over slow lines."""
 
 LOAD_MS = 90_000
-"""For the first picture without a graphics card."""
+"""Timeout of the first frame without a graphics card."""
 
 SETTLE_S = 3.0
-"""For the robot and a person to be in the picture, not only the cell."""
+"""Delay until the robot and a person are in the picture, not only the cell."""
 
-# Without a graphics card WebGL is reckoned by SwiftShader.
+# Without a graphics card, SwiftShader renders WebGL.
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 WITHOUT_NOTICES = ".mantine-Notifications-root { display: none }"
-"""That there is no graphics card here is nothing about the demo."""
+"""Hides the browser's notice of a missing graphics card, which does not concern the demo."""
 
 
 async def take(folder: Path) -> None:
@@ -60,7 +60,7 @@ async def take(folder: Path) -> None:
     """
     browser_path = shutil.which("chromium")
     if browser_path is None:
-        raise ConfigError("chromium: not found; scripts/system-packages installs it")
+        raise ConfigError("chromium: expected it to be installed, found none; scripts/system-packages installs it")
     with tempfile.TemporaryDirectory(prefix="cellwatch-pictures-") as scratch:
         fleet = Fleet(FleetOptions(), Path(scratch))
         async with fleet.processes, PowerSwitch(fleet.switch_power) as power:
@@ -69,7 +69,7 @@ async def take(folder: Path) -> None:
             await fleet.start_units()
             link = await fleet.viewer_link()
             if link is None:
-                raise ConfigError("the master has no viewer: expected viser to be installed")
+                raise ConfigError("the master has no viewer; expected viser to be installed")
             async with async_playwright() as playwright:
                 browser = await playwright.chromium.launch(executable_path=browser_path, args=FLAGS)
                 page = await browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
@@ -105,7 +105,7 @@ def _png(frame: Image.Image) -> bytes:
 def _gif(frames: list[Image.Image]) -> bytes:
     data = io.BytesIO()
     small = [frame.resize((GIF_WIDTH, GIF_HEIGHT), Image.Resampling.LANCZOS) for frame in frames]
-    # One palette for all, that of a frame in which all colours occur, so that only what moves is written anew.
+    # One palette for all, from a frame with all colours, so that only changes are written again.
     palette = small[-1].quantize(COLOURS)
     first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in small)
     first.save(data, "GIF", save_all=True, append_images=others, duration=FRAME_MS, loop=0, optimize=True)
@@ -120,9 +120,9 @@ def _keep(path: Path, data: bytes, bytes_max: int) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Take the pictures; exit code 1 when they cannot be taken."""
+    """Take the pictures; exit code 1 if they cannot be taken."""
     parser = argparse.ArgumentParser(prog="window_pictures", description="The README's pictures of the viewer.")
-    parser.add_argument("folder", type=Path, help="for viewer.png and viewer.gif")
+    parser.add_argument("folder", type=Path, help="folder for viewer.png and viewer.gif")
     options = parser.parse_args(arguments)
     try:
         asyncio.run(take(options.folder))

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands and moves in the simulated cell.
+"""Objects, robot and people in the simulated cell.
 
 In the order of the flow:
 
-    scene       what stands where at one moment, and whose it is
-    robot_path  how the robot moves
+    scene       all bodies at one moment, and their owners
+    robot_path  motion of the robot
     people      people who walk and reach, as capsules
-    world       a cell with its robot, people and unknown things
-    handling    what people do to a camera: they knock it, cover it, plug in another
+    world       a cell with its robot, people and unknown objects
+    handling    handling of a camera by people: knock it, cover it, plug in another
 """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What people do to a simulated camera while it runs: they knock it, cover it, or plug in another one.
+"""Handling of a simulated camera while it runs: people knock it, cover it, or plug in another one.
 
-A file says what holds now. It is no configuration: it stands for hands.
+A file describes the present state. It is not a configuration: it replaces hands.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from shared.files import write_whole
 
 
 class Handling(BaseModel):
-    """What is done to one camera; left alone it hangs in its place of the rig.
+    """The handling of one camera; by default it is in its place of the rig.
 
-    `xyz` m and `rpy_deg` (fixed axes) are where it hangs, in the frame of a camera in its place. `serial` is that of
-    the camera that is plugged in, None: its own.
+    `xyz` (m) and `rpy_deg` (fixed axes) are its pose in the frame of a camera in its place. `serial` is the serial of
+    the plugged-in camera; None: its own.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -30,7 +30,7 @@ class Handling(BaseModel):
     serial: str | None = None
 
     def write(self, path: Path) -> None:
-        """From now on this is done to the camera that looks at `path`."""
+        """Apply this handling to the camera that reads `path`, from now on."""
         write_whole(path, self.model_dump_json().encode(), synced=False)
 
 
@@ -38,7 +38,7 @@ LEFT_ALONE = Handling()
 
 
 class Hands:
-    """The file of one camera, which need not be there."""
+    """The file of one camera; it need not exist."""
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
@@ -46,15 +46,15 @@ class Hands:
         self._now = LEFT_ALONE
 
     def now(self) -> Handling:
-        """What is done at this moment.
+        """Return the present handling.
 
         Raises:
-            SourceError: the file is no `Handling`.
+            SourceError: the file is not a valid `Handling`.
         """
         if self._path is None:
             return LEFT_ALONE
         try:
-            # A new file each time, so that its time and content belong together.
+            # The file is replaced each time, so that its time and content belong together.
             written_ns = self._path.stat().st_mtime_ns
             if written_ns != self._written_ns:
                 self._now = Handling.model_validate_json(self._path.read_bytes())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""People who walk a closed path and reach in with an arm now and then, as capsules.
+"""People who walk on a closed path and sometimes reach out with an arm, as capsules.
 
 Segment lengths are fractions of stature (Winter, Biomechanics and Motor Control of Human Movement).
 Limbs swing in the body's own vertical plane: x forward, y left, z up, origin on the floor below the pelvis.
@@ -24,10 +24,10 @@ UPPER_ARM, FOREARM = 0.186, 0.146
 SHOULDER_HALF, HIP_HALF = 0.115, 0.055
 
 STRIDE_M = 1.4
-"""Two steps of an adult who walks at some 1 m/s."""
+"""Two steps of an adult who walks at about 1 m/s."""
 
 RAMP_S = 0.8
-"""How long a person takes to stop and to start."""
+"""Time in which a person stops or starts."""
 
 LEG_SWING_RAD, KNEE_BEND_RAD, ARM_SWING_RAD = 0.42, 0.75, 0.45
 REACH_UPPER_RAD, REACH_LOWER_RAD, REACH_LEAN_RAD = 0.35, 1.30, 0.25
@@ -37,8 +37,8 @@ REACH_UPPER_RAD, REACH_LOWER_RAD, REACH_LEAN_RAD = 0.35, 1.30, 0.25
 class Loop:
     """A closed path on the floor: two straights of `straight_m`, joined by half circles of `radius_m`.
 
-    It runs counter-clockwise about `centre_m` (2,). Arc length 0 is the middle of the straight that lies to the
-    right of `heading_rad`, the direction in which that straight is walked.
+    It runs counter-clockwise around `centre_m` (2,). Arc length 0 is the middle of the straight to the right of
+    `heading_rad`, the direction of walking on that straight.
     """
 
     centre_m: tuple[float, float]
@@ -48,11 +48,11 @@ class Loop:
 
     @property
     def length_m(self) -> float:
-        """Once around."""
+        """Length of one lap."""
         return 2.0 * self.straight_m + 2.0 * math.pi * self.radius_m
 
     def at(self, arc_m: float) -> tuple[float, float, float]:
-        """(x, y) in metres and direction in rad, world, at an arc length of any size."""
+        """Return (x, y) in metres and direction in rad, world frame, at any arc length."""
         half, radius = 0.5 * self.straight_m, self.radius_m
         rest = arc_m % self.length_m
         bend = math.pi * radius
@@ -78,10 +78,10 @@ class Loop:
 
 @dataclass(frozen=True)
 class Person:
-    """Walks `loop`, and once a lap stops at its arc length 0, turns right and reaches out for `dwell_s`.
+    """A person who walks `loop`, and once a lap stops at its arc length 0, turns right and reaches out for `dwell_s`.
 
-    `start_s` shifts where in the lap the person is at time 0; `floor_m` is the height of the floor;
-    `left_handed` tells which arm reaches.
+    `start_s` is the person's time in the lap at time 0; `floor_m` is the height of the floor; `left_handed` selects the
+    arm that reaches.
     """
 
     loop: Loop
@@ -94,7 +94,7 @@ class Person:
 
     @property
     def lap_s(self) -> float:
-        """After this long everything repeats."""
+        """Duration of a lap, after which everything repeats."""
         return self._walk_s + self.dwell_s
 
     @property
@@ -103,7 +103,7 @@ class Person:
         return self.loop.length_m / self.speed_m_s + RAMP_S
 
     def motion(self, t_s: float) -> tuple[float, float, float]:
-        """Arc length in metres, vigour of the walk (0 standing, 1 full speed), reach (0 to 1)."""
+        """Return arc length in metres, vigour of the walk (0 at rest, 1 full speed), and reach (0 to 1)."""
         time_s = (t_s + self.start_s) % self.lap_s
         if time_s >= self._walk_s:
             share = (time_s - self._walk_s) / self.dwell_s if self.dwell_s else 0.0
@@ -116,10 +116,10 @@ class Person:
         return self.speed_m_s * way_s, min(starting, stopping), 0.0
 
     def capsules(self, t_s: float) -> Capsules:
-        """The person at `t_s`, world, metres."""
+        """Return the person at `t_s`, world frame, metres."""
         arc_m, vigour, reach = self.motion(t_s)
         x_m, y_m, direction_rad = self.loop.at(arc_m)
-        # A whole number of strides a lap, so that the legs do not jump where the lap begins.
+        # A whole number of strides a lap, so that the legs do not jump at its start.
         strides = max(round(self.loop.length_m / STRIDE_M), 1)
         gait_rad = 2.0 * math.pi * strides * arc_m / self.loop.length_m
         points = np.array(self._joints(gait_rad, vigour, reach)) * self.stature_m
@@ -139,7 +139,7 @@ class Person:
         return self.stature_m * np.array((0.062, 0.083, 0.045, 0.032, 0.055, *limbs, *limbs))
 
     def _joints(self, gait_rad: float, vigour: float, reach: float) -> list[Point]:
-        """Both ends of each capsule in turn, in statures, body frame, the pelvis at height 0."""
+        """Return both ends of each capsule in turn, in statures, body frame, the pelvis at height 0."""
         lean_rad = 0.05 * vigour + REACH_LEAN_RAD * reach
         neck = (TRUNK * math.sin(lean_rad), 0.0, TRUNK * math.cos(lean_rad))
         chin = _from(neck, math.pi - 0.5 * lean_rad, NECK + 0.02)
@@ -172,17 +172,17 @@ class Person:
 
 
 def smooth(share: float) -> float:
-    """From 0 at 0 to 1 at 1 without a corner; constant beyond."""
+    """Rise from 0 at 0 to 1 at 1 with a continuous slope; constant beyond."""
     x = min(max(share, 0.0), 1.0)
     return x * x * (3.0 - 2.0 * x)
 
 
 def _smooth_integral(share: float) -> float:
-    """The integral of `smooth` from 0 to `share` >= 0."""
+    """Return the integral of `smooth` from 0 to `share` >= 0."""
     x = min(share, 1.0)
     return x * x * x * (1.0 - 0.5 * x) + max(share - 1.0, 0.0)
 
 
 def _from(point: Point, angle_rad: float, length: float) -> Point:
-    """`length` away from `point`, at `angle_rad` from straight down towards forward."""
+    """Return the point at `length` from `point`, at `angle_rad` from straight down towards forward."""
     return (point[0] + length * math.sin(angle_rad), point[1], point[2] - length * math.cos(angle_rad))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the robot moves: on sinusoids, so that all derivatives exist, or as fast as it can, with sharp reversals."""
+"""Motion of the robot: on sinusoids, so that all derivatives exist, or at full speed with sharp reversals."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from shared.errors import InputError
 
 
 class JointPath(Protocol):
-    """Where the joints are at any time; `home_rad` (n,) is where they swing about."""
+    """Joint positions over time; `home_rad` (n,) is the centre of the motion."""
 
     @property
     def home_rad(self) -> NDArray[np.float64]:
-        """(n,) rad."""
+        """Centre of the motion (n,) in rad."""
         ...
 
     def joints_at(self, t_s: float) -> NDArray[np.float64]:
-        """Joint positions (n,) in rad."""
+        """Return joint positions (n,) in rad."""
         ...
 
     def velocities_at(self, t_s: float) -> NDArray[np.float64]:
-        """Joint velocities (n,) in rad/s."""
+        """Return joint velocities (n,) in rad/s."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class RobotPath:
-    """Joint j stands at `home_rad[j] + sum_k amplitude_rad[k, j] * sin(2 pi k (t / period_s) + phase_rad[k, j])`.
+    """Joint j is at `home_rad[j] + sum_k amplitude_rad[k, j] * sin(2 pi k (t / period_s) + phase_rad[k, j])`.
 
     k counts from 1, so that everything repeats after `period_s`. Arrays: `home_rad` (n,), the others (K, n).
     """
@@ -43,13 +43,15 @@ class RobotPath:
 
     @classmethod
     def still(cls, joints_rad: ArrayLike) -> RobotPath:
-        """A robot that stands at `joints_rad` (n,)."""
+        """Return the path of a robot at rest at `joints_rad` (n,)."""
         home = np.array(joints_rad, dtype=np.float64)
         return cls(home, np.zeros((1, len(home))), np.zeros((1, len(home))), 1.0)
 
     @classmethod
     def demo(cls, speed: float = 1.0) -> RobotPath:
-        """A UR3e over the demo cell's table: its tool moves at some 0.4 m/s, at most 1 m/s at `speed` 1.
+        """Return a path of a UR3e over the demo cell's table; its tool moves at about 0.4 m/s, at most 1 m/s.
+
+        These speeds are for `speed` 1.
 
         Raises:
             InputError: `speed` is not above 0.
@@ -59,11 +61,11 @@ class RobotPath:
         return cls(_HOME_RAD, _AMPLITUDE_RAD, _PHASE_RAD, _PERIOD_S / speed)
 
     def joints_at(self, t_s: float) -> NDArray[np.float64]:
-        """Joint positions (n,) in rad."""
+        """Return joint positions (n,) in rad."""
         return np.asarray(self.home_rad + (self.amplitude_rad * np.sin(self._angles(t_s))).sum(axis=0))
 
     def velocities_at(self, t_s: float) -> NDArray[np.float64]:
-        """Joint velocities (n,) in rad/s."""
+        """Return joint velocities (n,) in rad/s."""
         return np.asarray((self.amplitude_rad * self._rates() * np.cos(self._angles(t_s))).sum(axis=0))
 
     def _rates(self) -> NDArray[np.float64]:
@@ -76,10 +78,10 @@ class RobotPath:
 
 @dataclass(frozen=True, eq=False)
 class ShuttlePath:
-    """Each joint goes to and fro between `home_rad - reach_rad` and `home_rad + reach_rad` at trapezoidal speed.
+    """Each joint moves between `home_rad - reach_rad` and `home_rad + reach_rad` with a trapezoidal speed profile.
 
-    It speeds up at `acceleration_rad_s2`, goes on at `speed_rad_s`, slows down as hard, and turns back without a pause.
-    Arrays (n,); a joint without reach stands still.
+    It accelerates at `acceleration_rad_s2`, moves at `speed_rad_s`, decelerates equally, and reverses without a pause.
+    Arrays (n,); a joint without reach is at rest.
     """
 
     home_rad: NDArray[np.float64]
@@ -88,7 +90,7 @@ class ShuttlePath:
     acceleration_rad_s2: float
 
     def joints_at(self, t_s: float) -> NDArray[np.float64]:
-        """Joint positions (n,) in rad."""
+        """Return joint positions (n,) in rad."""
         way, t, forth, ramp_s, stroke_s = self._stroke(t_s)
         ramp = 0.5 * self.acceleration_rad_s2 * ramp_s
         a = 0.5 * self.acceleration_rad_s2
@@ -100,7 +102,7 @@ class ShuttlePath:
         return np.asarray(self.home_rad + np.where(forth, gone - 0.5 * way, 0.5 * way - gone))
 
     def velocities_at(self, t_s: float) -> NDArray[np.float64]:
-        """Joint velocities (n,) in rad/s."""
+        """Return joint velocities (n,) in rad/s."""
         _, t, forth, ramp_s, stroke_s = self._stroke(t_s)
         speed = self.acceleration_rad_s2 * np.minimum(np.minimum(t, stroke_s - t), ramp_s)
         return np.asarray(np.where(forth, speed, -speed))
@@ -108,9 +110,9 @@ class ShuttlePath:
     def _stroke(
         self, t_s: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
-        """Of each joint (n,): the way it goes, how far into it, whether forth, and the times of a ramp and a stroke."""
+        """Return for each joint (n,): distance, time within it, direction, and the times of a ramp and a stroke."""
         way = 2.0 * self.reach_rad
-        # Where the way is too short for full speed it is all ramps.
+        # If the distance is too short for full speed, it consists of ramps only.
         top = np.minimum(self.speed_rad_s, np.sqrt(way * self.acceleration_rad_s2))
         ramp_s = top / self.acceleration_rad_s2
         stroke_s = ramp_s + np.divide(way, top, out=np.ones_like(way), where=top > 0.0)

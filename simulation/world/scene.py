@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands where at one moment, and whose it is; what a renderer makes of it."""
+"""All bodies at one moment with their owners, and the view of them that a renderer makes."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from shared.meshes import TriangleMesh
 from shared.transforms import Transform, from_rotation_translation, look_at
 
 CAPSULE_SEGMENTS = 48
-"""A torso of 0.15 m radius is then nowhere more than 0.4 mm inside the true capsule."""
+"""A torso of 0.15 m radius is then at most 0.4 mm inside the true capsule."""
 
 MAX_CAPSULE_MESHES = 512
-"""Shapes kept as meshes: 17 a person, so thirty people of different stature."""
+"""Limit of meshes kept: 17 a person, so thirty people of different stature."""
 
 
 class Owner(IntEnum):
-    """Whose surface a pixel shows."""
+    """Owner of the surface that a pixel shows."""
 
     NOTHING = 0
     STATIC = 1
@@ -35,7 +35,7 @@ class Owner(IntEnum):
 
 
 FIRST_UNKNOWN = Owner.PERSON
-"""From here on an owner is what a unit should report. The room is in no model either, but outside the cell's box."""
+"""First owner that a unit should report. The room is in no model either, but it is outside the cell's box."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Capsules:
 
     @classmethod
     def joined(cls, parts: list[Capsules]) -> Capsules:
-        """All capsules of `parts`, in their order; none when there are none."""
+        """Return all capsules of `parts`, in their order."""
         if not parts:
             return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.uint8))
         return cls(
@@ -76,12 +76,12 @@ class Capsules:
         )
 
     def bodies(self) -> tuple[Body, ...]:
-        """The same as closed meshes; equal shapes share one mesh."""
+        """Return the capsules as closed meshes; equal shapes share one mesh."""
         found = []
         for i in range(len(self)):
             a_m, b_m = self.a_m[i], self.b_m[i]
             length_m = float(np.linalg.norm(b_m - a_m))
-            # Rounded to the micrometre, so that a limb's mesh is found again in the next frame.
+            # Rounded to the micrometre, so that the next frame finds a limb's mesh again.
             mesh = capsule_mesh(round(length_m, 6), round(float(self.radius_m[i]), 6))
             pose = look_at(a_m, b_m) if length_m > 1e-6 else from_rotation_translation(np.eye(3), a_m)
             found.append(Body(f"capsule {i}", mesh, pose, Owner(int(self.owner[i]))))
@@ -90,10 +90,10 @@ class Capsules:
 
 @lru_cache(maxsize=MAX_CAPSULE_MESHES)
 def capsule_mesh(length_m: float, radius_m: float) -> TriangleMesh:
-    """A closed mesh of the points within `radius_m` of the segment from the origin to (0, 0, `length_m`)."""
+    """Return a closed mesh of the points within `radius_m` of the segment from the origin to (0, 0, `length_m`)."""
     quarter = CAPSULE_SEGMENTS // 4
     latitude = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 2 * quarter + 1)
-    # The equator stands twice: once at each end of the segment.
+    # The equator occurs twice: once at each end of the segment.
     latitude = np.concatenate((latitude[: quarter + 1], latitude[quarter:]))[1:-1]
     along = np.repeat((0.0, length_m), quarter)
     longitude = np.arange(CAPSULE_SEGMENTS) * (2.0 * math.pi / CAPSULE_SEGMENTS)
@@ -122,28 +122,28 @@ def capsule_mesh(length_m: float, radius_m: float) -> TriangleMesh:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One moment. `fixed` is the same tuple for as long as nothing in it moves, so that renderers may keep it."""
+    """All bodies at one moment. `fixed` is the same tuple while nothing in it moves, so that renderers can cache it."""
 
     fixed: tuple[Body, ...]
     moving: tuple[Body, ...]
     capsules: Capsules
 
     def bodies(self) -> tuple[Body, ...]:
-        """Everything as placed meshes, capsules included."""
+        """Return all bodies as placed meshes, including capsules."""
         return (*self.fixed, *self.moving, *self.capsules.bodies())
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a perfect camera sees: `z_m` (H, W) float32, inf where nothing stands, and `owner` (H, W) uint8."""
+    """View of a perfect camera: `z_m` (H, W) float32, inf without a surface, and `owner` (H, W) uint8."""
 
     z_m: NDArray[np.float32]
     owner: NDArray[np.uint8]
 
 
 class Renderer(Protocol):
-    """Bound to one camera; draws scene after scene. Two of them exist so that one bug cannot hide in both."""
+    """Draw scenes for one camera. There are two renderers, so that one bug cannot hide in both."""
 
     def render(self, scene: Scene) -> View:
-        """True depth along the optical axis and owner, at integer pixel centres. The arrays are the caller's."""
+        """Return true depth along the optical axis and owner, at integer pixel centres, in arrays of the caller."""
         ...

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cell with its robot, people, and things that no model knows; where all of it is at any time."""
+"""A cell with its robot, people and unknown objects, as a function of time."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MAX_DEMO_PEOPLE = 2
 
 @dataclass(frozen=True, eq=False)
 class Thing:
-    """A body that is in no model. It is there from `from_s` until `until_s`, and drifts with `velocity_m_s`."""
+    """An unknown body. It is present from `from_s` until `until_s`, and drifts with `velocity_m_s`."""
 
     name: str
     mesh: TriangleMesh
@@ -37,7 +37,7 @@ class Thing:
     velocity_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def pose_at(self, t_s: float) -> Transform:
-        """`T_world_mesh` at `t_s`; the pose given is that of time 0."""
+        """Return `T_world_mesh` at `t_s`; the given pose is that of time 0."""
         if not any(self.velocity_m_s):
             return self.T_world_mesh
         pose = self.T_world_mesh.copy()
@@ -47,7 +47,7 @@ class Thing:
 
 @dataclass(frozen=True)
 class Absence:
-    """A known body of the cell, static or object, that is taken away from `from_s` until `until_s`."""
+    """A known body of the cell, static or object, that is absent from `from_s` until `until_s`."""
 
     name: str
     from_s: float = -math.inf
@@ -56,7 +56,7 @@ class Absence:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What really stands in the cell, as a pure function of time; `room` is what stands about it and never moves."""
+    """True content of the cell as a pure function of time; `room` surrounds it and never moves."""
 
     cell: Cell
     robot_path: JointPath | None = None
@@ -81,9 +81,9 @@ class World:
 
     @classmethod
     def demo(cls, people: int = 1, seed: int = 0, cell: Cell | None = None) -> World:
-        """The demo cell with its moving robot and up to two people who walk beside the table.
+        """Return the demo cell with its moving robot and up to two people who walk beside the table.
 
-        `seed` decides who walks where at time 0, how tall and how fast.
+        `seed` determines each person's stature, speed and place at time 0.
 
         Raises:
             InputError: there is no room for so many people.
@@ -91,19 +91,19 @@ class World:
         return cls(cell or Cell.load(DEMO_CELL), RobotPath.demo(), demo_people(people, seed), room=(demo_room(),))
 
     def with_things(self, *things: Thing) -> World:
-        """The same world with these unknown things besides."""
+        """Return the same world with additional unknown objects."""
         return replace(self, things=(*self.things, *things))
 
     def joints_at(self, t_s: float) -> NDArray[np.float64] | None:
-        """Joint positions (n,) in rad; none without a robot."""
+        """Return joint positions (n,) in rad; None without a robot."""
         return None if self.cell.robot is None or self.robot_path is None else self.robot_path.joints_at(t_s)
 
     def velocities_at(self, t_s: float) -> NDArray[np.float64] | None:
-        """Joint velocities (n,) in rad/s; none without a robot."""
+        """Return joint velocities (n,) in rad/s; None without a robot."""
         return None if self.cell.robot is None or self.robot_path is None else self.robot_path.velocities_at(t_s)
 
     def scene(self, t_s: float) -> Scene:
-        """All that stands in the cell at `t_s`."""
+        """Return all bodies in the cell at `t_s`."""
         absent = frozenset(gone.name for gone in self.absences if gone.from_s <= t_s < gone.until_s)
         fixed = self._fixed.get(absent)
         if fixed is None:
@@ -129,12 +129,12 @@ class World:
 
     @cached_property
     def _fixed(self) -> dict[frozenset[str], tuple[Body, ...]]:
-        """The fixed part of scenes by what is absent: at most two to the number of absences."""
+        """Fixed part of scenes by the absent bodies: at most two to the number of absences."""
         return {}
 
 
 def demo_people(count: int, seed: int = 0) -> tuple[Person, ...]:
-    """People who walk along the demo cell's table, the first on its -y side, the second on its +y side.
+    """Return people who walk along the demo cell's table, the first on its -y side, the second on its +y side.
 
     Raises:
         InputError: `count` is not 0 to `MAX_DEMO_PEOPLE`.
@@ -159,14 +159,14 @@ def demo_people(count: int, seed: int = 0) -> tuple[Person, ...]:
 
 
 def demo_room() -> Body:
-    """Walls and ceiling about the demo cell's floor, outside its box: what cameras see beyond the cell."""
+    """Return walls and ceiling around the demo cell's floor, outside its box: the background of the cameras' views."""
     T_world_room = from_rotation_translation(np.eye(3), (0.0, 0.0, 1.2))
     return Body("room", box_mesh("room", (6.1, 6.1, 4.2)), T_world_room, Owner.ROOM)
 
 
 _DEMO_FLOOR_M = -0.75
 
-# Both face the table from where they stop, and reach over its end with the arm that is away from the robot.
+# Both face the table at their stop, and reach over its end with the arm on the far side from the robot.
 _DEMO_LOOPS = (
     Loop(centre_m=(0.50, -0.92), heading_rad=math.pi, straight_m=0.8, radius_m=0.18),
     Loop(centre_m=(0.50, 0.92), heading_rad=0.0, straight_m=0.8, radius_m=0.18),

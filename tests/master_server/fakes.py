@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,11 +29,9 @@ from shared.messages import (
 from shared.settings import Settings
 from shared.timebase import Exchange
 from shared.wire import keys_to_bytes, pack_seen
-
-S = 1_000_000_000
-MS = 1_000_000
-START_NS = 10_000_000 * S
-"""Of the master's clock, in tests that have no clock."""
+from tests.set_clock import MS as MS
+from tests.set_clock import START_NS as START_NS
+from tests.set_clock import S as S
 
 AT_ORIGIN: Matrix = (
     (1.0, 0.0, 0.0, 0.0),
@@ -56,54 +54,6 @@ def cell(with_robot: bool = False) -> Cell:
 def master(with_robot: bool = False, **settings: Any) -> Master:
     """A master of that cell."""
     return Master(cell(with_robot), Settings(**settings))
-
-
-@dataclass(eq=False)
-class SetTimer:
-    """A call that a `SetClock` makes when its time has come."""
-
-    at_ns: int
-    do: Callable[[], object]
-    cancelled: bool = False
-
-    def cancel(self) -> None:
-        self.cancelled = True
-
-
-@dataclass
-class SetClock:
-    """A clock that goes on only when it is told to, and then makes the calls that are due in their order."""
-
-    now: int = START_NS
-    timers: list[SetTimer] = field(default_factory=list)
-
-    def now_ns(self) -> int:
-        return self.now
-
-    def call_at(self, at_ns: int, do: Callable[[], object]) -> SetTimer:
-        self.timers.append(SetTimer(at_ns, do))
-        return self.timers[-1]
-
-    def due_ns(self) -> int | None:
-        """When the next call is due; None when none is."""
-        self.timers = [timer for timer in self.timers if not timer.cancelled]
-        return min((timer.at_ns for timer in self.timers), default=None)
-
-    def go_to(self, now_ns: int) -> None:
-        """Go on to this time."""
-        while (due_ns := self.due_ns()) is not None and due_ns <= now_ns:
-            timer = min(self.timers, key=lambda timer: timer.at_ns)
-            self.timers.remove(timer)
-            self.now = max(self.now, timer.at_ns)
-            timer.do()
-        self.now = max(self.now, now_ns)
-
-    def step(self) -> int:
-        """Go on to the next call that is due, and return its time."""
-        due_ns = self.due_ns()
-        assert due_ns is not None
-        self.go_to(due_ns)
-        return self.now
 
 
 @dataclass

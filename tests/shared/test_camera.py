@@ -39,11 +39,11 @@ def test_axes_are_optical_and_pixel_centres_are_integers() -> None:
     np.testing.assert_allclose(points[2, 2], [0.0, 1.0, 2.0])
 
 
-def test_no_measurement_is_the_camera_itself() -> None:
+def test_pixels_without_measurement_deproject_to_the_origin() -> None:
     np.testing.assert_array_equal(D435.deproject(np.zeros(D435.shape, dtype=np.uint16)), 0.0)
 
 
-def test_stereo_noise_follows_the_imagers_not_the_picture() -> None:
+def test_stereo_noise_uses_the_focal_length_of_the_imagers() -> None:
     # At 2 m, 0.1 px of disparity of a 50 mm baseline at 420 px is 19 mm.
     assert D435.disparity_noise_m(0.1) * 2.0**2 == pytest.approx(0.019, rel=0.01)
     assert D435.stereo_focal_px == D435.fx
@@ -102,7 +102,7 @@ def test_impossible_cameras_are_refused(change: dict[str, float]) -> None:
         ({"skew": 0.0}, "intrinsics: skew: extra inputs are not permitted, got 0.0"),
     ],
 )
-def test_a_camera_of_wrong_numbers_is_one_clear_error(change: dict[str, Any], message: str) -> None:
+def test_invalid_numbers_raise_one_clear_error(change: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError) as caught:
         Intrinsics(**(D435.model_dump() | change))
     assert str(caught.value) == message
@@ -112,18 +112,18 @@ def test_a_camera_of_wrong_numbers_is_one_clear_error(change: dict[str, Any], me
     ("document", "words"),
     [
         ({"height": 1}, "expected width, fx, fy, cx, cy, got none"),
-        (dict[Any, Any](D435.model_dump()) | {1: 2}, "expected text as names"),
+        (dict[Any, Any](D435.model_dump()) | {1: 2}, "expected field names as text"),
         ({**D435.model_dump(), "fx": -1.0}, "intrinsics: fx: input should be greater than 0, got -1.0"),
         (None, "instance of Intrinsics"),
     ],
 )
-def test_a_wrong_camera_inside_a_model_is_the_fault_of_the_model(document: Any, words: str) -> None:
+def test_a_model_reports_its_invalid_camera(document: Any, words: str) -> None:
     with pytest.raises(ValidationError, match=words) as caught:
         TypeAdapter(dict[str, Intrinsics]).validate_python({"camera": document})
     assert caught.value.errors()[0]["loc"][0] == "camera"
 
 
-def test_camera_travels_and_cannot_be_changed() -> None:
+def test_camera_survives_json_and_is_frozen() -> None:
     assert Intrinsics.model_validate_json(D435.model_dump_json()) == D435
     with pytest.raises(ValidationError, match="frozen"):
         D435.fx = 1.0  # type: ignore[misc]  # what must fail

@@ -35,7 +35,7 @@ def written(folder: Path, text: str, head: str = "name: c\nbox: {min: [-1, -1, -
     return file
 
 
-def test_demo_cell_is_whole(demo: Cell) -> None:
+def test_demo_cell_is_complete(demo: Cell) -> None:
     assert demo.name == "demo"
     np.testing.assert_array_equal(demo.box_min_m, [-1.5, -1.5, -0.75])
     np.testing.assert_array_equal(demo.box_max_m, [1.5, 1.5, 1.5])
@@ -58,7 +58,7 @@ def test_demo_cell_is_whole(demo: Cell) -> None:
 
 
 @pytest.mark.parametrize("path", [None, 5, b"x"])
-def test_what_is_no_path_is_one_clear_error(path: Any) -> None:
+def test_invalid_path_types_raise_one_clear_error(path: Any) -> None:
     with pytest.raises(CellError) as caught:
         Cell.load(path)
     assert str(caught.value) == f"cell: expected the path of a cell file as text or Path, got {type(path).__name__}"
@@ -69,7 +69,7 @@ def world_bounds_m(body: PlacedMesh) -> list[list[float]]:
     return [points.min(axis=0).tolist(), points.max(axis=0).tolist()]
 
 
-def test_demo_furniture_stands_on_what_it_should(demo: Cell) -> None:
+def test_demo_furniture_stands_on_the_floor_and_the_table(demo: Cell) -> None:
     floor, table, shelf = (world_bounds_m(body) for body in demo.static)
     (tray,) = (world_bounds_m(body) for body in demo.objects)
     assert floor[1][2] == pytest.approx(-0.75)
@@ -81,7 +81,7 @@ def test_demo_furniture_stands_on_what_it_should(demo: Cell) -> None:
     assert all((np.array(corner) < demo.box_max_m).all() for corner in inside)
 
 
-def test_demo_links_stand_where_the_visual_ones_do(demo: Cell) -> None:
+def test_demo_links_match_the_visual_meshes(demo: Cell) -> None:
     # Its link meshes are placed by hand; wrong by a turn, they would miss the URDF's visual meshes by centimetres.
     package = importlib.util.find_spec("airo_models")
     assert package is not None
@@ -117,7 +117,7 @@ def test_demo_board_lies_on_the_table_printed_side_up(demo: Cell) -> None:
     np.testing.assert_allclose(board.T_world_board[:3, 2], [0.0, 0.0, -1.0], atol=1e-12)
 
 
-def test_demo_meshes_are_what_their_script_writes(tmp_path: Path) -> None:
+def test_demo_meshes_match_the_output_of_their_script(tmp_path: Path) -> None:
     script = shutil.copy(CELLS / "demo" / "make_meshes.py", tmp_path)
     spec = importlib.util.spec_from_file_location("make_meshes", script)
     assert spec is not None
@@ -149,7 +149,7 @@ def test_variable_that_is_not_set_is_named(monkeypatch: pytest.MonkeyPatch) -> N
         Cell.load(CELLS / "xarm7" / "cell.yaml")
 
 
-def test_document_comes_back_the_same(demo: Cell) -> None:
+def test_document_round_trip(demo: Cell) -> None:
     document, meshes = demo.to_document()
     for carried in (json.loads(json.dumps(document)), msgpack.unpackb(msgpack.packb(document))):
         again = Cell.from_document(carried, meshes)
@@ -166,7 +166,7 @@ def test_document_comes_back_the_same(demo: Cell) -> None:
     assert Cell.from_document(*bare.to_document()).to_document() == bare.to_document()
 
 
-def test_version_tells_cells_apart(demo: Cell) -> None:
+def test_version_distinguishes_cells(demo: Cell) -> None:
     assert demo.version == Cell.load(CELLS / "demo" / "cell.yaml").version
     moved = demo.with_object_pose("tray", from_xyz_rpy((0.5, -0.2, 0.0), (0.0, 0.0, 0.3)))
     assert moved.version != demo.version
@@ -304,37 +304,37 @@ TURN = '<joint name="j" type="continuous"><parent link="a"/><child link="b"/></j
 SHAPE = "<collision><geometry><box size='1 1 1'/></geometry></collision>"
 
 BAD = {
-    "missing stl": ("static: [{name: a, mesh: gone.stl}]\n", "static[0].mesh: expected a file, got nothing at"),
-    "missing object": ("objects: [{name: a, mesh: gone.stl}]\n", "objects[0].mesh: expected a file, got nothing at"),
+    "missing stl": ("static: [{name: a, mesh: gone.stl}]\n", "static[0].mesh: expected a file at"),
+    "missing object": ("objects: [{name: a, mesh: gone.stl}]\n", "objects[0].mesh: expected a file at"),
     "empty stl": (
         "static: [{name: a, mesh: empty.stl}]\n",
         "static[0].mesh: {folder}/empty.stl: expected a mesh with tri",
     ),
     "noise": ("static: [{name: a, mesh: noise.ply}]\n", "static[0].mesh: {folder}/noise.ply: expected a readable mesh"),
     "millimetres": ("static: [{name: a, mesh: mm.stl}]\n", "for a file in millimetres set scale 0.001"),
-    "no urdf": ("robot: {urdf: gone.urdf}\n", "robot.urdf: expected a file, got nothing at {folder}/gone.urdf"),
+    "no urdf": ("robot: {urdf: gone.urdf}\n", "robot.urdf: expected a file at {folder}/gone.urdf, found none"),
     "bad urdf": ("robot: {urdf: empty.stl}\n", "robot: {folder}/empty.stl: expected a URDF file, got malformed XML"),
-    "bare urdf": ("robot: {urdf: bare.urdf}\n", "robot: expected links with meshes to filter by, got none"),
+    "bare urdf": ("robot: {urdf: bare.urdf}\n", "robot: expected at least one link with a mesh, got none"),
     "joints": (
         "robot: {urdf: r.urdf, joints: [k]}\n",
         "robot: {folder}/r.urdf: expected actuated joints out of j, got k",
     ),
     "link mesh": (
         "robot: {urdf: r.urdf, link_meshes: {b: {mesh: gone.stl}}}\n",
-        "robot.link_meshes.b.mesh: expected a file, got nothing at",
+        "robot.link_meshes.b.mesh: expected a file at",
     ),
     "link": ("robot: {urdf: r.urdf, link_meshes: {c: {box: [1, 1, 1]}}}\n", "expected links of a, b, got c"),
-    "tool": ("robot: {urdf: r.urdf, tool: {mesh: gone.stl}}\n", "robot.tool.mesh: expected a file, got nothing at"),
+    "tool": ("robot: {urdf: r.urdf, tool: {mesh: gone.stl}}\n", "robot.tool.mesh: expected a file at"),
     "tool parent": (
         "robot: {urdf: r.urdf, tool: {box: [1, 1, 1], parent: hand}}\n",
         "robot: {folder}/r.urdf: expected a link to hold the tool, got hand",
     ),
     "dh mesh": (
         "robot: {dh: {joints: [{}, {link: {mesh: gone.stl}}]}}\n",
-        "robot.dh.joints[1].link.mesh: expected a file, got nothing at",
+        "robot.dh.joints[1].link.mesh: expected a file at",
     ),
     "dh base": ("robot: {dh: {base: {mesh: gone.stl}, joints: [{}]}}\n", "robot.dh.base.mesh: expected a file"),
-    "dh without meshes": ("robot: {dh: {joints: [{}]}}\n", "robot: expected links with meshes to filter by, got none"),
+    "dh without meshes": ("robot: {dh: {joints: [{}]}}\n", "robot: expected at least one link with a mesh, got none"),
     "dh names": (
         "robot: {dh: {base: {box: [1, 1, 1]}, joints: [{name: a}, {name: a}]}}\n",
         "robot: robot: expected each joint once, got a more than once",

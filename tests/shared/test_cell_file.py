@@ -32,7 +32,9 @@ from shared.errors import CellError
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 MANUAL = (CHECKOUT / "docs" / "cell.md").read_text(encoding="utf-8")
-SECTIONS: dict[str, tuple[type[BaseModel], type[BaseModel] | None]] = {  # heading: model, and what is told elsewhere
+SECTIONS: dict[
+    str, tuple[type[BaseModel], type[BaseModel] | None]
+] = {  # heading: model, and what is documented elsewhere
     "The file": (CellFile, None),
     "Box": (BoxFile, None),
     "Bodies": (BodyFile, ShapeFile),
@@ -57,21 +59,21 @@ def written(folder: Path, text: str) -> Path:
 
 
 @pytest.mark.parametrize("heading", SECTIONS)
-def test_manual_tells_every_key_and_its_default(heading: str) -> None:
+def test_manual_lists_every_key_and_its_default(heading: str) -> None:
     model, elsewhere = SECTIONS[heading]
     section = re.search(rf"^#+ {heading}\n(.*?)(?=^#+ )", MANUAL, re.DOTALL | re.MULTILINE)
     assert section is not None
-    told = dict(re.findall(r"^\| `(\w+)` \| (.*?) \|", section[1], re.MULTILINE))
+    documented = dict(re.findall(r"^\| `(\w+)` \| (.*?) \|", section[1], re.MULTILINE))
     fields = {
         name: field for name, field in model.model_fields.items() if name not in getattr(elsewhere, "model_fields", {})
     }
-    assert set(told) == set(fields)
+    assert set(documented) == set(fields)
     for name, field in fields.items():
-        assert (told[name] == "required") == field.is_required(), name
+        assert (documented[name] == "required") == field.is_required(), name
         default = field.get_default(call_default_factory=True, validated_data={})
         if not field.is_required() and default is not None and not isinstance(default, BaseModel):
             plain = list(default) if isinstance(default, tuple) else default
-            assert yaml.safe_load(told[name].strip("`")) == plain, name
+            assert yaml.safe_load(documented[name].strip("`")) == plain, name
 
 
 def test_manual_names_every_model() -> None:
@@ -122,7 +124,7 @@ BAD = {
         "robot: {urdf: r.urdf, link_meshes: {elbow: {mesh: a.stl, size: 1}}}\n",
         "robot.link_meshes.elbow.size: expected a key out of mesh, scale, box, cylinder, pose, got an unknown one",
     ),
-    "twice": ("static: []\nstatic: []\n", "line 4: expected YAML, got a fault: the key static stands there twice"),
+    "twice": ("static: []\nstatic: []\n", "line 4: expected YAML, got a syntax error: duplicate key static"),
     "scale": ("static: [{name: a, mesh: a.stl, scale: -1}]\n", "static[0].scale: expected greater than 0, got -1"),
     "text": ("static: [{name: a, mesh: a.stl, scale: 1e-3}]\n", "static[0].scale: expected a number, got '1e-3'"),
     "truth": ("static: [{name: a, mesh: a.stl, scale: true}]\n", "static[0].scale: expected a number, got True"),
@@ -165,7 +167,7 @@ BAD = {
     "no keys": ("robot: [1]\n", "robot: expected keys and values, got a list"),
     "nothing": ("static: [null]\n", "static[0]: expected keys and values, got nothing"),
     "date": ("robot: {urdf: 2026-01-01}\n", "robot.urdf: expected text, got something else"),
-    "yaml": ("static: [\n", "line 4: expected YAML, got a fault: expected the node content"),
+    "yaml": ("static: [\n", "line 4: expected YAML, got a syntax error: expected the node content"),
 }
 
 
@@ -199,10 +201,10 @@ def test_every_problem_gets_its_own_sentence(tmp_path: Path) -> None:
         (b"- 1\n", "expected keys and values, got list"),
         (b"\xff\xfe\x00", "expected a YAML file in UTF-8"),
         (b"name: c\n", "box: expected a value, got none"),
-        (b"!!python/object:os.system {}\n", "expected YAML, got a fault: could not determine a constructor"),
+        (b"!!python/object:os.system {}\n", "expected YAML, got a syntax error: could not determine a constructor"),
     ],
 )
-def test_what_is_no_cell_file_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
+def test_invalid_cell_files_are_refused(tmp_path: Path, content: bytes, words: str) -> None:
     file = tmp_path / "cell.yaml"
     file.write_bytes(content)
     with pytest.raises(CellError, match=re.escape(words)):
@@ -237,16 +239,16 @@ def test_every_form_of_path_finds_its_file(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("gone.stl", "k: expected a file, got nothing at"),
-        ("", "k: expected a file, got nothing at"),
+        ("gone.stl", "k: expected a file at"),
+        ("", "k: expected a file at"),
         ("$CELL_TEST_UNSET/a.stl", "k: expected the environment variable CELL_TEST_UNSET to be set, for $CELL_TEST"),
         ("package:no_such_wheel/a.stl", "k: expected an installed package no_such_wheel, for package:no_such_wheel"),
         ("package:", "k: expected an installed package (no name), for package:"),
-        ("package:airo_models/gone.stl", "k: expected a file, got nothing at"),
-        ("package:airo-models/gone.stl", "k: expected a file, got nothing at"),
+        ("package:airo_models/gone.stl", "k: expected a file at"),
+        ("package:airo-models/gone.stl", "k: expected a file at"),
     ],
 )
-def test_paths_that_lead_nowhere_are_named(tmp_path: Path, text: str, words: str) -> None:
+def test_paths_to_missing_files_are_named(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(CellError) as caught:
         named_file(tmp_path / "cell.yaml", "k", text)
     assert str(caught.value).startswith(f"{tmp_path / 'cell.yaml'}: {words}")
@@ -259,5 +261,5 @@ def test_integers_are_lengths_too(tmp_path: Path) -> None:
 
 
 def test_values_nested_too_deeply_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(CellError, match=r"cell\.yaml: .*nested too deeply"):
+    with pytest.raises(CellError, match=r"cell\.yaml: .*expected a few levels of nesting"):
         read_cell_file(written(tmp_path, MINIMAL + "static: " + "[" * 3000 + "]" * 3000 + "\n"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Announcements: what is told, what is believed to be one, and masters heard of on loopback."""
+"""Announcements: their encoding, their validation, and discovery of masters on loopback."""
 
 from __future__ import annotations
 
@@ -14,7 +14,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shared import discovery
-from shared.discovery import SERVICE_TYPE, AddressChanges, Announcement, Announcer, Browser, Offer, offer_of, places
+from shared.discovery import (
+    SERVICE_TYPE,
+    AddressChanges,
+    Announcement,
+    Announcer,
+    Browser,
+    Offer,
+    addresses_to_announce,
+    offer_of,
+)
 from shared.errors import WireError
 from shared.waiting import within
 
@@ -29,14 +38,14 @@ def received(says: Announcement) -> dict[bytes, bytes | None]:
     return {key.encode(): value.encode() for key, value in says.properties().items()}
 
 
-def test_what_a_master_tells_arrives() -> None:
+def test_an_announcement_round_trip() -> None:
     offer = offer_of(f"demo at pc 1a2b.{SERVICE_TYPE}", 8420, ["10.0.0.2", "192.168.0.3"], received(SAYS))
     assert offer.name == "demo at pc 1a2b"
     assert offer.says == Announcement("demo", "ab" * 8, 3, True, "cd" * 8)
     assert offer.urls == ("https://10.0.0.2:8420", "https://192.168.0.3:8420")
 
 
-def test_each_value_fits_whatever_the_cell_is_called() -> None:
+def test_each_value_fits_for_any_name_of_the_cell() -> None:
     says = Announcement("\x00" + "Zelle Ä " * 60, "ab" * 32, 3)
     assert all(len(f"{key}={value}".encode()) < 256 for key, value in says.properties().items())
     offer = offer_of("x", 1, ["10.0.0.2"], received(says))
@@ -59,7 +68,7 @@ def test_each_value_fits_whatever_the_cell_is_called() -> None:
         ({}, 1, ["10.0.0.2"], "a\x1b[2J"),
     ],
 )
-def test_what_is_no_announcement_of_ours_is_refused(
+def test_invalid_announcements_are_refused(
     changed: dict[bytes, bytes | None], port: int | None, addresses: list[str], name: str
 ) -> None:
     with pytest.raises(WireError, match="announcement"):
@@ -71,7 +80,7 @@ def test_what_is_no_announcement_of_ours_is_refused(
     st.none() | st.integers(-1, 70000),
     st.dictionaries(st.sampled_from([key.encode() for key in SAYS.properties()]), st.none() | st.binary(max_size=255)),
 )
-def test_nothing_but_a_wire_error_comes_of_anything_else(
+def test_any_record_is_an_offer_or_a_wire_error(
     name: str, port: int | None, properties: dict[bytes, bytes | None]
 ) -> None:
     with contextlib.suppress(WireError):
@@ -89,14 +98,14 @@ def test_nothing_but_a_wire_error_comes_of_anything_else(
         ("127.0.0.5", [LOOPBACK, FIRST], ["127.0.0.1"], ["127.0.0.5"]),
     ],
 )
-def test_where_it_is_announced(
+def test_addresses_to_announce(
     host: str, own: list[IPv4Interface], interfaces: list[str], addresses: list[str]
 ) -> None:
-    assert places(host, own) == (interfaces, addresses)
+    assert addresses_to_announce(host, own) == (interfaces, addresses)
 
 
-async def heard(browser: Browser, good: Callable[[tuple[Offer, ...]], bool]) -> tuple[Offer, ...]:
-    """The offers, as soon as they are good."""
+async def discovered(browser: Browser, good: Callable[[tuple[Offer, ...]], bool]) -> tuple[Offer, ...]:
+    """Return the offers as soon as `good` accepts them."""
     loop = asyncio.get_running_loop()
     deadline_s = loop.time() + 15.0
     while not good(offers := await browser.offers()):
@@ -106,7 +115,7 @@ async def heard(browser: Browser, good: Callable[[tuple[Offer, ...]], bool]) -> 
     return offers
 
 
-async def test_two_masters_of_one_cell_are_heard_of_and_taken_back() -> None:
+async def test_two_masters_of_one_cell_are_discovered_and_withdrawn() -> None:
     ours = f"cell {socket.gethostname()} {id(SAYS)}"
 
     def mine(offers: tuple[Offer, ...]) -> list[int]:
@@ -116,11 +125,11 @@ async def test_two_masters_of_one_cell_are_heard_of_and_taken_back() -> None:
     announcing = [asyncio.create_task(Announcer(lambda: says, "127.0.0.1", port).run()) for port in (1001, 1002)]
     try:
         async with Browser() as browser:
-            offers = await heard(browser, lambda offers: mine(offers) == [1001, 1002])
+            offers = await discovered(browser, lambda offers: mine(offers) == [1001, 1002])
             assert len({offer.name for offer in offers}) == len(offers)
             first = announcing.pop(0)
             first.cancel()
-            await heard(browser, lambda offers: mine(offers) == [1002])
+            await discovered(browser, lambda offers: mine(offers) == [1002])
             await asyncio.gather(first, return_exceptions=True)
     finally:
         for task in announcing:
@@ -128,27 +137,27 @@ async def test_two_masters_of_one_cell_are_heard_of_and_taken_back() -> None:
         await asyncio.gather(*announcing, return_exceptions=True)
 
 
-async def test_a_change_of_the_cell_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_change_of_the_cell_is_announced(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(discovery, "POLL_S", 1.5)
     ours = f"changing {socket.gethostname()} {id(SAYS)}"
     versions = ["11" * 32]
     announcer = Announcer(lambda: Announcement(ours, versions[0], 3), "127.0.0.1", 1003)
     task = asyncio.create_task(announcer.run())
 
-    def told(sha256: str) -> Callable[[tuple[Offer, ...]], bool]:
+    def announces(sha256: str) -> Callable[[tuple[Offer, ...]], bool]:
         return lambda offers: any(offer.says == Announcement(ours, sha256, 3) for offer in offers)
 
     try:
         async with Browser() as browser:
-            await heard(browser, told("11" * 8))
+            await discovered(browser, announces("11" * 8))
             versions[0] = "22" * 32
-            await heard(browser, told("22" * 8))
+            await discovered(browser, announces("22" * 8))
     finally:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_addresses_that_the_kernel_does_not_tell_of_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_addresses_are_polled_without_notifications_of_the_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: object) -> socket.socket:
         raise OSError("not in this sandbox")
 

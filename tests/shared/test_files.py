@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of which all or nothing is there."""
+"""Atomic writes and state files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shared.files import STATE_MAX_BYTES, StateFile, write_private, write_whole
 
 
 @pytest.mark.parametrize("synced", [True, False])
-def test_a_file_is_replaced_whole(tmp_path: Path, synced: bool) -> None:
+def test_a_file_is_replaced_atomically(tmp_path: Path, synced: bool) -> None:
     path = tmp_path / "state.json"
     (tmp_path / "state.partial").write_text("half")
     for content in (b"one", b"another"):
@@ -22,7 +22,7 @@ def test_a_file_is_replaced_whole(tmp_path: Path, synced: bool) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_only_what_is_private_is_closed_to_others(tmp_path: Path) -> None:
+def test_only_private_files_are_unreadable_by_others(tmp_path: Path) -> None:
     mask = os.umask(0o022)
     try:
         write_whole(tmp_path / "open", b"")
@@ -33,7 +33,7 @@ def test_only_what_is_private_is_closed_to_others(tmp_path: Path) -> None:
     assert (tmp_path / "closed").stat().st_mode & 0o777 == 0o600
 
 
-def test_what_cannot_be_written_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_write_keeps_the_old_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_whole(tmp_path / "file", b"one")
 
     def full(_: int) -> None:
@@ -46,7 +46,7 @@ def test_what_cannot_be_written_leaves_what_was_there(tmp_path: Path, monkeypatc
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
 
 
-def test_state_is_kept_and_the_same_is_not_written_again(tmp_path: Path) -> None:
+def test_state_is_stored_and_equal_state_is_not_written_again(tmp_path: Path) -> None:
     file = StateFile(tmp_path / "new" / "state.json")
     assert file.load(dict) is None
     file.save({"a": 1})
@@ -69,16 +69,16 @@ def parse(document: Any) -> int:
     [b"", b"\xff", b"[]", b"{}", b'{"a": "b"}', b"[" * (STATE_MAX_BYTES - 1), b" " * STATE_MAX_BYTES + b'{"a": 1}'],
     ids=["empty", "no text", "no map", "no a", "no number", "deep", "long"],
 )
-def test_a_damaged_document_is_as_good_as_none_and_why_is_told(
+def test_a_damaged_document_is_ignored_with_a_warning(
     tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "state.json"
     path.write_bytes(content)
     assert StateFile(path).load(parse) is None
-    assert f"{path}: passed over: " in caplog.text
+    assert f"{path}: ignored, since it cannot be read: " in caplog.text
 
 
-def test_what_cannot_be_kept_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failed_save_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "file").write_text("a file where a folder should be")
     StateFile(tmp_path / "file" / "state.json").save({})
     assert "state.json: cannot be written" in caplog.text

@@ -220,7 +220,7 @@ def test_joints_come_in_the_order_of_the_chain(tmp_path: Path) -> None:
     assert Robot.from_urdf(urdf_file(tmp_path, MIXED)).joint_names == ("slide", "turn", "finger_joint")
 
 
-def test_held_joints_stand_still_and_so_does_what_follows_them(tmp_path: Path) -> None:
+def test_held_joints_and_their_mimic_joints_do_not_move(tmp_path: Path) -> None:
     file = urdf_file(tmp_path, MIXED)
     full = Robot.from_urdf(file)
     held = Robot.from_urdf(file, held_joints={"slide": 0.3, "finger_joint": -0.2})
@@ -229,7 +229,7 @@ def test_held_joints_stand_still_and_so_does_what_follows_them(tmp_path: Path) -
     assert [link.moving for link in held.links] == [False, False, True, True, True]
 
 
-def test_tool_hangs_on_the_last_link_or_where_it_is_told(tmp_path: Path) -> None:
+def test_tool_is_on_the_last_link_or_the_named_parent(tmp_path: Path) -> None:
     tool = box_mesh("gripper", (0.1, 0.1, 0.1))
     file = urdf_file(tmp_path, MIXED)
     with pytest.raises(
@@ -246,7 +246,7 @@ def test_tool_hangs_on_the_last_link_or_where_it_is_told(tmp_path: Path) -> None
     np.testing.assert_array_equal(serial.link_poses(np.ones(6))[0], serial.frame_pose("tool0", np.ones(6)))
 
 
-def test_tool_may_hang_on_a_link_named_tool(tmp_path: Path) -> None:
+def test_tool_may_be_on_a_link_named_tool(tmp_path: Path) -> None:
     text = ur3_urdf().replace("tool0", "tool")
     robot = Robot.from_urdf(urdf_file(tmp_path, text), tool=box_mesh("t", (1, 1, 1)), tool_parent="tool")
     assert [link.name for link in robot.links] == ["mounted_tool"]
@@ -287,7 +287,7 @@ def test_link_meshes_of_the_real_robot(data_dir: Path) -> None:
     assert not robot.links[0].moving
 
 
-def test_displacement_is_a_bound_and_not_a_loose_one() -> None:
+def test_displacement_is_a_tight_bound() -> None:
     robot = ur3_dh(meshes=True, tool=box_mesh("t", (0.1, 0.1, 0.3)))
     rng = np.random.default_rng(5)
     for uncertainty in (0.001, 0.05, 2.0):
@@ -321,7 +321,7 @@ def test_displacement_of_prismatic_and_mimic_joints_is_exact(tmp_path: Path) -> 
     assert finger["finger_left"] == pytest.approx(2.0 * math.sin(0.05) * math.hypot(0.05, 0.005), rel=1e-6)
 
 
-def test_wrong_joints_name_the_joints_that_are_expected() -> None:
+def test_errors_of_joints_name_the_expected_joints() -> None:
     robot = ur3_dh(meshes=True)
     names = ", ".join(joint[0] for joint in UR3_JOINTS)
     bad: tuple[Any, ...] = (
@@ -350,9 +350,7 @@ def test_wrong_joints_name_the_joints_that_are_expected() -> None:
 
 @settings(max_examples=25)
 @given(st.lists(st.floats(-7.0, 7.0), min_size=3, max_size=3))
-def test_document_comes_back_the_same_through_json(
-    tmp_path_factory: pytest.TempPathFactory, values: list[float]
-) -> None:
+def test_document_round_trip_through_json(tmp_path_factory: pytest.TempPathFactory, values: list[float]) -> None:
     file = urdf_file(tmp_path_factory.getbasetemp(), MIXED)
     robot = Robot.from_urdf(file, T_world_base=from_xyz_rpy((1, 2, 3), (0.1, 0.2, 0.3)))
     document, meshes = robot.to_document()
@@ -398,7 +396,7 @@ def test_bad_documents_are_refused() -> None:
         Robot.from_document(document, {})
 
 
-def test_contradictory_tables_and_rows_are_refused() -> None:
+def test_inconsistent_tables_and_rows_are_refused() -> None:
     motion = Motion("revolute", BASE, identity(), (0.0, 0.0, 1.0), 0)
     with pytest.raises(KinematicsError, match="r: expected each joint once, got a more than once"):
         Robot("r", ["a", "a"], [motion, Motion("revolute", 0, identity(), (0.0, 0.0, 1.0), 1)], [])
@@ -414,7 +412,7 @@ def test_contradictory_tables_and_rows_are_refused() -> None:
         Robot.from_dh([DHJoint(f"j{index}") for index in range(129)], [None] * 130)
 
 
-def test_contradiction_found_after_reading_names_the_file(tmp_path: Path) -> None:
+def test_inconsistency_found_after_reading_names_the_file(tmp_path: Path) -> None:
     links = "".join(f'<link name="l{index}"/>' for index in range(130))
     joints = "".join(
         f'<joint name="j{index}" type="continuous"><parent link="l{index}"/><child link="l{index + 1}"/></joint>'
@@ -426,7 +424,7 @@ def test_contradiction_found_after_reading_names_the_file(tmp_path: Path) -> Non
     assert str(caught.value) == f"{file}: snake: expected at most 128 moving joints, got 129"
 
 
-def test_unknown_and_forgotten_joints_are_named(tmp_path: Path) -> None:
+def test_unknown_and_missing_joints_are_named(tmp_path: Path) -> None:
     file = urdf_file(tmp_path, MIXED)
     free = "slide, turn, finger_joint"
     with pytest.raises(KinematicsError, match=f"expected actuated joints out of {free}, got finger_right_joint"):
@@ -446,7 +444,7 @@ def test_unknown_and_forgotten_joints_are_named(tmp_path: Path) -> None:
         Robot.from_urdf(file)
 
 
-def test_robot_without_joints_stands() -> None:
+def test_robot_without_joints() -> None:
     robot = Robot(
         "post", [], [], [Attachment("post", BASE, from_xyz_rpy((0, 0, 1), (0, 0, 0)), box_mesh("p", (1, 1, 1)))]
     )
@@ -456,7 +454,7 @@ def test_robot_without_joints_stands() -> None:
     assert robot.displacement_m(0.1, []).tolist() == [0.0]
 
 
-def test_kinematics_fit_into_a_frame() -> None:
+def test_kinematics_stay_within_their_budget() -> None:
     robot = ur3_dh(meshes=True)
     positions = np.full(6, 0.3)
     robot.link_poses(positions)

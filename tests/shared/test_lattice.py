@@ -23,7 +23,7 @@ lattices = st.builds(
 
 
 def points_in(lattice: Lattice, data: st.DataObject) -> NDArray[np.float64]:
-    """Points (N, 3) in and around the lattice."""
+    """Draw points (N, 3) in and around the lattice."""
     shares: list[tuple[float, ...]] = data.draw(
         st.lists(st.tuples(*[st.floats(-0.5, 1.5)] * 3), min_size=1, max_size=20)
     )
@@ -38,7 +38,7 @@ def test_point_lies_in_the_voxel_of_its_index(lattice: Lattice, data: st.DataObj
 
 
 @given(lattices, st.data())
-def test_index_is_the_floor_as_python_counts_it(lattice: Lattice, data: st.DataObject) -> None:
+def test_index_is_the_floor_of_python(lattice: Lattice, data: st.DataObject) -> None:
     points = points_in(lattice, data)
     expected = [
         [math.floor((float(p) - o) / lattice.voxel_size_m) for p, o in zip(point, lattice.origin_m, strict=True)]
@@ -48,7 +48,7 @@ def test_index_is_the_floor_as_python_counts_it(lattice: Lattice, data: st.DataO
 
 
 @given(lattices, st.data())
-def test_centres_come_back_as_their_index(lattice: Lattice, data: st.DataObject) -> None:
+def test_index_of_a_centre_is_its_index(lattice: Lattice, data: st.DataObject) -> None:
     one_axis = st.integers(-40, 40)
     indices = np.array(data.draw(st.lists(st.tuples(one_axis, one_axis, one_axis), min_size=1, max_size=20)))
     np.testing.assert_array_equal(lattice.index(lattice.centres(indices)), indices)
@@ -66,7 +66,7 @@ def test_keys_count_all_voxels_once_in_order(lattice: Lattice) -> None:
 
 
 @given(st.floats(-20.0, 20.0), st.integers(1, 400), st.sampled_from([0.01, 0.02, 0.03, 0.05, 0.07, 0.1]))
-def test_covering_has_no_voxel_too_many_or_too_few(low: float, count: int, size: float) -> None:
+def test_covering_has_the_exact_count_of_voxels(low: float, count: int, size: float) -> None:
     # A box of a whole number of voxels, as people write it, in decimal.
     high = round(low, 2) + round(count * size, 2)
     lattice = Lattice.covering((round(low, 2), 0.0, 0.0), (high, size, size), size)
@@ -74,7 +74,7 @@ def test_covering_has_no_voxel_too_many_or_too_few(low: float, count: int, size:
 
 
 @given(st.floats(-20.0, 20.0), st.floats(0.001, 10.0), st.floats(0.02, 0.1))
-def test_covering_holds_every_point_of_the_box(low: float, length: float, size: float) -> None:
+def test_covering_contains_every_point_of_the_box(low: float, length: float, size: float) -> None:
     high = low + length
     assume(high > low)
     lattice = Lattice.covering((low, low, low), (high, high, high), size)
@@ -99,7 +99,7 @@ def test_origin_off_the_grid_does_not_shift_anything() -> None:
     np.testing.assert_array_equal(lattice.index(np.array([0.049, 0.0, 0.499])), [0, 0, 9])
 
 
-def test_images_of_points_keep_their_shape() -> None:
+def test_arrays_of_points_keep_their_shape() -> None:
     lattice = Lattice((0, 0, 0), 0.1, (4, 4, 4))
     points = np.zeros((2, 5, 3), dtype=np.float32)
     assert lattice.index(points).shape == (2, 5, 3)
@@ -108,7 +108,7 @@ def test_images_of_points_keep_their_shape() -> None:
     assert lattice.keys(np.zeros((0, 3), dtype=np.int16)).shape == (0,)
 
 
-def test_what_lies_outside_has_no_key() -> None:
+def test_indices_outside_have_no_key() -> None:
     lattice = Lattice((0, 0, 0), 0.1, (2, 3, 4))
     for index in ([2, 0, 0], [0, 3, 0], [0, 0, 4], [-1, 0, 0]):
         with pytest.raises(InputError, match=r"expected 0 <= index < \(2, 3, 4\)"):
@@ -118,7 +118,7 @@ def test_what_lies_outside_has_no_key() -> None:
             lattice.indices(np.array([key]))
 
 
-def test_largest_lattice_and_the_next_one() -> None:
+def test_largest_lattice_is_accepted_and_larger_refused() -> None:
     assert Lattice((0, 0, 0), 0.01, (512, 512, 512)).cell_count == MAX_CELLS
     key = Lattice((0, 0, 0), 0.01, (512, 512, 512)).keys(np.array([[511, 511, 511]]))
     assert key[0] == MAX_CELLS - 1
@@ -179,7 +179,7 @@ def test_impossible_boxes_are_refused(low: tuple[float, ...], high: tuple[float,
         ((0, 0, 0), 0.1, (), "lattice shape: expected three counts of 1 to 32767, got ()"),
     ],
 )
-def test_what_is_no_lattice_is_one_clear_error(origin: Any, size: Any, shape: Any, message: str) -> None:
+def test_invalid_lattices_raise_one_clear_error(origin: Any, size: Any, shape: Any, message: str) -> None:
     with pytest.raises(InputError) as caught:
         Lattice(origin, size, shape)
     assert str(caught.value) == message
@@ -194,7 +194,7 @@ def test_what_is_no_lattice_is_one_clear_error(origin: Any, size: Any, shape: An
         ((0, 0, 0), (1, 1, 1), "x", "voxel_size_m: expected a positive length, got 'x'"),
     ],
 )
-def test_what_is_no_box_is_one_clear_error(low: Any, high: Any, size: Any, message: str) -> None:
+def test_invalid_boxes_raise_one_clear_error(low: Any, high: Any, size: Any, message: str) -> None:
     with pytest.raises(InputError) as caught:
         Lattice.covering(low, high, size)
     assert str(caught.value) == message
@@ -220,7 +220,7 @@ def test_what_is_no_box_is_one_clear_error(low: Any, high: Any, size: Any, messa
         ("indices", [[1], [2, 3]], "keys: expected integers, got [[1], [2, 3]]"),
     ],
 )
-def test_what_is_no_place_is_one_clear_error(call: str, value: Any, message: str) -> None:
+def test_invalid_points_raise_one_clear_error(call: str, value: Any, message: str) -> None:
     with pytest.raises(InputError) as caught:
         getattr(Lattice((0, 0, 0), 0.1, (2, 3, 4)), call)(value)
     assert str(caught.value).startswith(message)
@@ -238,9 +238,7 @@ def test_equal_lattices_are_equal() -> None:
     st.tuples(*[st.integers(1, 500)] * 3).filter(lambda shape: np.prod(shape) <= MAX_CELLS),
     st.data(),
 )
-def test_keys_and_indices_are_each_others_inverse_and_keys_ascend_as_indices_do(
-    shape: tuple[int, int, int], data: st.DataObject
-) -> None:
+def test_keys_and_indices_are_inverse_and_in_the_same_order(shape: tuple[int, int, int], data: st.DataObject) -> None:
     lattice = Lattice((0.0, 0.0, 0.0), 0.1, shape)
     _, ny, nz = shape
     triples = data.draw(st.lists(st.tuples(*[st.integers(0, count - 1) for count in shape]), max_size=20))

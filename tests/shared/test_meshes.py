@@ -88,7 +88,7 @@ def test_mirrored_open_surface_keeps_its_front(tmp_path: Path) -> None:
     assert np.cross(b - a, c - a)[2] > 0.0
 
 
-def test_parts_of_a_scene_stand_where_their_nodes_put_them_in_the_unit_of_the_file(tmp_path: Path) -> None:
+def test_parts_of_a_scene_have_the_poses_of_their_nodes_and_the_unit_of_the_file(tmp_path: Path) -> None:
     file = tmp_path / "scene.dae"
     file.write_text(COLLADA)
     mesh = load_mesh(file)
@@ -96,7 +96,7 @@ def test_parts_of_a_scene_stand_where_their_nodes_put_them_in_the_unit_of_the_fi
     np.testing.assert_allclose(mesh.bounds_m, [[0.0, 0.0, 0.0], [1.1, 0.1, 0.1]], atol=1e-6)
 
 
-def test_inside_out_solids_are_turned_each_by_itself() -> None:
+def test_inside_out_solids_are_reversed_separately() -> None:
     vertices, faces = box_triangles()
     away = np.add(vertices, (10.0, 0.0, 0.0))
     turned = np.concatenate((faces, faces[:, ::-1] + len(vertices)))
@@ -105,14 +105,14 @@ def test_inside_out_solids_are_turned_each_by_itself() -> None:
     assert volume_m3(mesh) == pytest.approx(12.0)
 
 
-def test_open_surface_is_kept_and_called_open() -> None:
+def test_open_surface_is_kept_as_open() -> None:
     vertices, faces = box_triangles()
     mesh = TriangleMesh.of_triangles("lidless", vertices, faces[:-1])
     assert not mesh.closed
     assert len(mesh.faces) == 11
 
 
-def test_one_triangle_turned_over_makes_a_mesh_open() -> None:
+def test_one_reversed_triangle_makes_a_mesh_open() -> None:
     vertices, faces = box_triangles()
     faces = faces.copy()
     faces[3] = faces[3, ::-1]
@@ -135,7 +135,7 @@ def test_repeated_vertices_are_merged_and_flat_triangles_dropped() -> None:
     assert (len(mesh.vertices), len(mesh.faces), mesh.closed) == (8, 12, True)
 
 
-def test_flat_triangle_in_a_seam_leaves_a_solid_closed() -> None:
+def test_flat_triangle_in_a_seam_keeps_a_solid_closed() -> None:
     # A tetrahedron, one edge of which has a middle vertex on one side only, bridged by a triangle without area.
     vertices = np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, 2], [1, 0, 0]], dtype=np.float64)
     faces = np.array([[0, 2, 4], [4, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3], [0, 4, 1]])
@@ -150,7 +150,7 @@ def test_merging_does_not_depend_on_the_sign_of_zero() -> None:
     assert len(mesh.vertices) == 4
 
 
-def test_long_tower_is_one_part() -> None:
+def test_chain_of_touching_boxes_is_one_part() -> None:
     # A label must travel through all the boxes, each of which only touches the next.
     vertices, faces = box_triangles(inside_out=True)
     count = 300
@@ -185,7 +185,7 @@ def test_concatenation_and_transform() -> None:
     assert not concatenated("mixed", [one, sheet]).closed
 
 
-def test_bytes_come_back_and_do_not_hold_the_name() -> None:
+def test_bytes_round_trip_without_the_name() -> None:
     mesh = cylinder_mesh("c", 0.1, 1.0)
     again = TriangleMesh.from_bytes(mesh.to_bytes(), "other")
     np.testing.assert_array_equal(again.vertices, mesh.vertices)
@@ -201,7 +201,7 @@ def test_arrays_cannot_be_changed() -> None:
             array[0] = 0
 
 
-def test_mesh_by_hash_checks_what_it_finds() -> None:
+def test_mesh_by_hash_checks_the_hash() -> None:
     mesh, other = box_mesh("b", (1, 1, 1)), box_mesh("o", (2, 1, 1))
     assert mesh_by_hash({mesh.sha256: mesh.to_bytes()}, mesh.sha256, "b").sha256 == mesh.sha256
     with pytest.raises(MeshError, match=r"mesh b: expected bytes with sha256 \w+, got none"):
@@ -273,7 +273,7 @@ def test_bad_file_is_one_sentence_that_names_it(tmp_path: Path, name: str) -> No
 
 
 def test_missing_file_folder_and_scale_are_named(tmp_path: Path) -> None:
-    with pytest.raises(MeshError, match=r"gone\.stl: expected a mesh file, got nothing there"):
+    with pytest.raises(MeshError, match=r"gone\.stl: expected a mesh file, got no such file"):
         load_mesh(tmp_path / "gone.stl")
     (tmp_path / "folder.stl").mkdir()
     with pytest.raises(MeshError, match=r"folder\.stl: expected a mesh file, got a folder"):
@@ -283,7 +283,7 @@ def test_missing_file_folder_and_scale_are_named(tmp_path: Path) -> None:
             load_mesh(tmp_path / "gone.stl", scale)
 
 
-def test_more_triangles_than_the_bound_are_refused() -> None:
+def test_more_triangles_than_the_limit_are_refused() -> None:
     faces = np.zeros((MAX_TRIANGLES + 1, 3), dtype=np.int32)
     with pytest.raises(MeshError, match="expected at most 1000000 triangles, got 1000001"):
         TriangleMesh("m", np.zeros((3, 3), dtype=np.float32), faces, closed=False)

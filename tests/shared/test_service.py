@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a service manager hears, over a socket of its own."""
+"""Messages to a service manager, received on a socket of the test."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Manager:
         self.socket.settimeout(5.0)
         self.environment = {"NOTIFY_SOCKET": address}
 
-    def hear(self) -> dict[str, str]:
+    def receive(self) -> dict[str, str]:
         lines = self.socket.recv(4096).decode().split("\n")
         return dict(line.split("=", 1) for line in lines)
 
@@ -39,33 +39,33 @@ def manager(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Manager]
     found.socket.close()
 
 
-def test_what_is_told(manager: Manager) -> None:
+def test_messages_to_the_manager(manager: Manager) -> None:
     service = ServiceManager(manager.environment)
-    assert service.listens
+    assert service.is_present
     service.ready("camera: none\nREADY=0; no master")
-    assert manager.hear() == {"READY": "1", "STATUS": "camera: none READY=0; no master"}
+    assert manager.receive() == {"READY": "1", "STATUS": "camera: none READY=0; no master"}
     service.alive("x" * 9000)
-    assert manager.hear() == {"WATCHDOG": "1", "STATUS": "x" * MAX_STATUS}
-    service.hangs("frame 3 hangs")
-    assert manager.hear() == {"STATUS": "frame 3 hangs", "WATCHDOG": "trigger"}
+    assert manager.receive() == {"WATCHDOG": "1", "STATUS": "x" * MAX_STATUS}
+    service.trigger_watchdog("frame 3 hangs")
+    assert manager.receive() == {"STATUS": "frame 3 hangs", "WATCHDOG": "trigger"}
     service.stopping()
-    assert manager.hear() == {"STOPPING": "1", "STATUS": "stopping"}
+    assert manager.receive() == {"STOPPING": "1", "STATUS": "stopping"}
 
 
-def test_without_a_manager_nobody_is_told() -> None:
+def test_no_message_without_a_manager() -> None:
     service = ServiceManager({})
-    assert not service.listens
+    assert not service.is_present
     assert service.watchdog_s is None
     service.ready("here")
 
 
-def test_a_manager_that_is_gone_or_reads_nothing_holds_nobody_up(tmp_path: Path) -> None:
+def test_a_manager_that_is_gone_or_does_not_read_never_blocks(tmp_path: Path) -> None:
     ServiceManager({"NOTIFY_SOCKET": str(tmp_path / "nobody")}).alive("here")
     manager = Manager(str(tmp_path / "notify"))
     service = ServiceManager(manager.environment)
     for _ in range(2000):
         service.alive("here")
-    assert manager.hear()["WATCHDOG"] == "1"
+    assert manager.receive()["WATCHDOG"] == "1"
     manager.socket.close()
 
 
@@ -80,38 +80,40 @@ def test_a_manager_that_is_gone_or_reads_nothing_holds_nobody_up(tmp_path: Path)
         ({"WATCHDOG_USEC": "soon"}, None),
     ],
 )
-def test_whether_it_watches(variables: dict[str, str], expected: float | None) -> None:
+def test_watchdog_limit(variables: dict[str, str], expected: float | None) -> None:
     assert ServiceManager({"NOTIFY_SOCKET": "/nowhere", **variables}, pid=7).watchdog_s == expected
     assert ServiceManager(variables, pid=7).watchdog_s is None
 
 
-async def test_what_hangs_at_two_looks_is_not_fed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+async def test_the_watchdog_is_triggered_when_two_checks_in_a_row_fail(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     manager = Manager(str(tmp_path / "notify"))
-    looks = iter([None, "frame 1 hangs", None, "frame 2 hangs", "frame 2 hangs", None])
+    checks = iter([None, "frame 1 hangs", None, "frame 2 hangs", "frame 2 hangs", None])
     service = ServiceManager({**manager.environment, "WATCHDOG_USEC": "40000"})
-    task = asyncio.create_task(service.follow(lambda: "live", lambda: next(looks)))
+    task = asyncio.create_task(service.follow(lambda: "live", lambda: next(checks)))
     with caplog.at_level(logging.ERROR), suppress(StopIteration, RuntimeError):
         await task
-    heard = [manager.hear()["WATCHDOG"] for _ in range(4)]
+    heard = [manager.receive()["WATCHDOG"] for _ in range(4)]
     assert heard == ["1", "1", "trigger", "1"]
     assert [record.message for record in caplog.records] == ["frame 2 hangs"]
     manager.socket.close()
 
 
-async def test_it_is_silent_once_cancelled(tmp_path: Path) -> None:
+async def test_no_message_after_cancellation(tmp_path: Path) -> None:
     manager = Manager(str(tmp_path / "notify"))
     service = ServiceManager({**manager.environment, "WATCHDOG_USEC": "40000"})
     task = asyncio.create_task(service.follow(lambda: "live"))
     await asyncio.sleep(0)
-    assert (await asyncio.to_thread(manager.hear))["WATCHDOG"] == "1"
-    assert (await asyncio.to_thread(manager.hear))["STATUS"] == "live"
+    assert (await asyncio.to_thread(manager.receive))["WATCHDOG"] == "1"
+    assert (await asyncio.to_thread(manager.receive))["STATUS"] == "live"
     task.cancel()
     with suppress(asyncio.CancelledError):
         await task
     manager.socket.setblocking(False)
     with suppress(BlockingIOError):
         while True:
-            manager.hear()
+            manager.receive()
     with pytest.raises(BlockingIOError):
-        manager.hear()
+        manager.receive()
     manager.socket.close()

@@ -12,18 +12,18 @@ S = 1_000_000_000
 
 
 def exchange(at_ns: int, offset_ns: int, there_ns: int, back_ns: int, between_ns: int = 0) -> Exchange:
-    """What an exchange looks like that the unit begins at `at_ns`."""
+    """Return an exchange that the unit starts at `at_ns`."""
     received_ns = at_ns + there_ns + offset_ns
     return Exchange(at_ns, received_ns, received_ns + between_ns, at_ns + there_ns + between_ns + back_ns)
 
 
-def test_equal_ways_give_the_offset() -> None:
+def test_equal_delays_give_the_exact_offset() -> None:
     one = exchange(5 * S, 1234 * S, 3 * MS, 3 * MS, between_ns=MS)
     assert one.offset_ns == 1234 * S
     assert one.uncertainty_ns == 3 * MS + RESOLUTION_NS
 
 
-def test_the_truth_lies_within_the_uncertainty_whatever_the_network_does() -> None:
+def test_the_true_offset_lies_within_the_uncertainty_for_any_delays() -> None:
     rng = random.Random(1)
     for _ in range(1000):
         offset_ns = rng.randrange(-(10**15), 10**15)
@@ -55,14 +55,14 @@ def test_the_estimate_follows_a_drifting_clock() -> None:
     assert clock.jumps == 0
 
 
-def test_uncertainty_grows_while_nothing_is_heard() -> None:
+def test_uncertainty_grows_without_exchanges() -> None:
     clock = ClockOffset()
     clock.add(exchange(0, 0, MS, MS))
     assert clock.uncertainty_ns(100 * S) == pytest.approx(MS + 100 * S * DRIFT_PPM_MAX / 1e6, rel=0.01)
 
 
 @pytest.mark.parametrize("jump_ns", [3600 * S, -3600 * S, 50 * MS])
-def test_a_jump_is_noticed_at_once(jump_ns: int) -> None:
+def test_a_jump_is_detected_at_once(jump_ns: int) -> None:
     clock = ClockOffset()
     for step in range(100):
         clock.add(exchange(step * 66 * MS, 0, MS, MS))
@@ -71,7 +71,7 @@ def test_a_jump_is_noticed_at_once(jump_ns: int) -> None:
     assert clock.jumps == 1
 
 
-def test_an_impossible_exchange_is_passed_over() -> None:
+def test_an_impossible_exchange_is_ignored() -> None:
     clock = ClockOffset()
     clock.add(Exchange(10, 0, 0, 5))
     clock.add(Exchange(0, 10, 5, 20))

@@ -28,7 +28,7 @@ def is_rigid(matrix: NDArray[np.float64]) -> bool:
 
 
 @given(poses)
-def test_inverse_undoes(pose: NDArray[np.float64]) -> None:
+def test_inverse_cancels(pose: NDArray[np.float64]) -> None:
     np.testing.assert_allclose(pose @ transforms.inverse(pose), np.eye(4), atol=1e-9)
     np.testing.assert_allclose(transforms.inverse(pose), np.linalg.inv(pose), atol=1e-9)
 
@@ -54,11 +54,11 @@ def test_rotation_about_keeps_its_axis_and_turns_by_its_angle(axis: Triple, angl
     np.testing.assert_allclose(rotation @ across, expected, atol=1e-9)
 
 
-def test_rotation_about_no_axis_is_none() -> None:
+def test_rotation_about_a_zero_axis_is_the_identity() -> None:
     np.testing.assert_array_equal(transforms.rotation_about((0, 0, 0), 1.0), np.eye(3))
 
 
-def test_quarter_turns_have_the_right_hand() -> None:
+def test_quarter_turns_are_right_handed() -> None:
     x, y, z = np.eye(3)
     for axis, before, after in ((z, x, y), (x, y, z), (y, z, x)):
         np.testing.assert_allclose(transforms.rotation_about(axis, math.pi / 2) @ before, after, atol=1e-12)
@@ -86,7 +86,7 @@ def test_look_at_is_an_optical_frame(eye: Triple, target: Triple, up: Triple) ->
     assert is_rigid(T_world_camera)
     in_camera = transforms.apply(transforms.inverse(T_world_camera), np.array(target))
     np.testing.assert_allclose(in_camera, np.array([0.0, 0.0, np.linalg.norm(forward)]), atol=1e-6)
-    # What is up in the world is up in the picture: against y.
+    # The up direction of the world is up in the image: minus y.
     assert (np.array(up) / np.linalg.norm(up)) @ T_world_camera[:3, 1] <= 1e-6
 
 
@@ -100,7 +100,7 @@ def test_look_at_straight_down_and_at_itself() -> None:
         transforms.look_at((1, 1, 1), (1, 1, 1))
 
 
-def test_apply_takes_images_of_points() -> None:
+def test_apply_keeps_the_shape_of_point_arrays() -> None:
     points = np.arange(24.0).reshape(2, 4, 3)
     T = transforms.from_xyz_rpy((1, 0, 0), (0, 0, math.pi / 2))
     result = transforms.apply(T, points)
@@ -128,19 +128,19 @@ def test_validated_returns_a_copy(pose: NDArray[np.float64]) -> None:
         (np.diag([0.001, 0.001, 0.001, 1.0]), "T_a_b: expected a right-handed rotation"),
     ],
 )
-def test_what_is_no_pose_is_refused(value: Any, words: str) -> None:
+def test_invalid_poses_are_refused(value: Any, words: str) -> None:
     with pytest.raises(InputError, match=words):
         transforms.validated(value, "T_a_b")
 
 
-def test_pose_with_few_digits_is_taken() -> None:
+def test_pose_with_few_digits_is_accepted() -> None:
     written = np.round(transforms.from_xyz_rpy((0.1, 0.2, 0.3), (0.4, 0.5, 0.6)), 5)
     np.testing.assert_array_equal(transforms.validated(written, "T"), written)
 
 
 @pytest.mark.parametrize("off", [1e-8, -3e-7, 1e-6])
-def test_rounding_in_the_last_row_is_taken_out(off: float) -> None:
-    """As an inverse in float32 leaves it, whichever of the four it is in."""
+def test_rounding_in_the_last_row_is_removed(off: float) -> None:
+    """Rounding of an inverse in float32, in each of the four entries."""
     pose = transforms.from_xyz_rpy((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
     for column in range(4):
         rounded = pose.copy()
@@ -149,7 +149,7 @@ def test_rounding_in_the_last_row_is_taken_out(off: float) -> None:
         assert rounded[3, column] != pose[3, column]
 
 
-def test_a_last_row_that_is_off_by_more_than_rounding_is_refused_as_it_came() -> None:
+def test_a_last_row_that_is_off_by_more_than_rounding_is_refused_with_its_values() -> None:
     for column in range(4):
         skewed = np.eye(4)
         skewed[3, column] += 2e-6

@@ -68,7 +68,7 @@ def test_mesh_files_are_found(tmp_path: Path, uri: str) -> None:
     np.testing.assert_allclose(mesh.bounds_m[1], [1.0, 0.5, 0.5])
 
 
-def test_packages_are_told_or_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_packages_are_given_or_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     part(tmp_path / "elsewhere" / "meshes")
     file = urdf(
         tmp_path / "robot", link("base", PARTS.format(uri="package://some_robot_wheel/meshes/part.stl", scale=""))
@@ -86,7 +86,7 @@ def test_packages_are_told_or_installed(tmp_path: Path, monkeypatch: pytest.Monk
     assert "some_robot_wheel" not in sys.modules
 
 
-def test_order_is_depth_first_whatever_the_file_says(tmp_path: Path) -> None:
+def test_order_is_depth_first_for_any_order_of_the_file(tmp_path: Path) -> None:
     file = urdf(
         tmp_path,
         *(link(name) for name in "edcba"),
@@ -99,7 +99,7 @@ def test_order_is_depth_first_whatever_the_file_says(tmp_path: Path) -> None:
     assert (model.root, [each.name for each in model.joints]) == ("a", ["ab", "be", "ad", "dc"])
 
 
-def test_foreign_prefixes_and_comments_do_not_disturb(tmp_path: Path) -> None:
+def test_foreign_prefixes_and_comments_are_ignored(tmp_path: Path) -> None:
     file = urdf(
         tmp_path,
         "<!-- a -->",
@@ -139,14 +139,14 @@ BAD = {
         f"<robot name='r'>{TWO}{joint('j', 'a', 'b', '<origin xyz=' + chr(34) + '0 0 nan' + chr(34) + '/>')}</robot>",
         "joint j: origin: expected finite numbers",
     ),
-    "two roots": (f"<robot name='r'>{TWO}</robot>", "expected one link that no joint holds, got a, b"),
+    "two roots": (f"<robot name='r'>{TWO}</robot>", "expected one link that is no joint's child, got a, b"),
     "two parents": (
         f"<robot name='r'>{TWO}{link('c')}{joint('j', 'a', 'c')}{joint('k', 'b', 'c')}</robot>",
         "expected one joint to hold link c, got several",
     ),
     "ring": (
         f"<robot name='r'>{TWO}{link('c')}{joint('j', 'a', 'b')}{joint('k', 'b', 'a')}</robot>",
-        "expected all joints to hang on c, got a ring of j, k",
+        "expected all joints below c, got a ring of j, k",
     ),
     "twice": (
         f"<robot name='r'>{TWO}{link('c')}{joint('j', 'a', 'b')}{joint('j', 'a', 'c')}</robot>",
@@ -187,7 +187,7 @@ def test_missing_file_and_unknown_link_are_named(tmp_path: Path) -> None:
         read_urdf(file, replaced={"elbow": box_mesh("e", (1, 1, 1))})
 
 
-def test_without_a_parser_the_reason_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_parser_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "yourdfpy", None)
-    with pytest.raises(KinematicsError, match="expected yourdfpy to read a URDF, but it is not installed"):
+    with pytest.raises(KinematicsError, match="expected yourdfpy to read a URDF, got no such package installed"):
         read_urdf(urdf(tmp_path, link("a")))

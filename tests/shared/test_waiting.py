@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Waiting with a limit."""
+"""Waiting with a timeout."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ import asyncio
 
 import pytest
 
-from shared.waiting import at_once_or_within, within
+from shared.waiting import at_once_or_within, done_within, sleep, wait_set, within
+from tests.set_clock import START_NS, S, SetClock
 
 pytestmark = pytest.mark.alone
 
 
-async def test_done_or_not() -> None:
+async def test_within_returns_whether_the_work_finished() -> None:
     event = asyncio.Event()
     assert not await within(0.01, event.wait())
     event.set()
     assert await within(0.01, event.wait())
 
 
-async def test_what_need_not_wait_is_done_in_the_task_of_the_caller() -> None:
+async def test_work_that_does_not_wait_runs_in_the_task_of_the_caller() -> None:
     ran_in: list[asyncio.Task[object] | None] = []
     event = asyncio.Event()
 
@@ -33,7 +34,7 @@ async def test_what_need_not_wait_is_done_in_the_task_of_the_caller() -> None:
     assert ran_in == [asyncio.current_task()] * 2
 
 
-async def test_what_has_to_wait_goes_on_where_it_was() -> None:
+async def test_work_that_waits_continues_at_its_first_wait() -> None:
     first, second = asyncio.Event(), asyncio.Event()
     done: list[str] = []
 
@@ -60,7 +61,7 @@ async def test_errors_are_raised_at_once_and_later(waits: bool) -> None:
         await at_once_or_within(1.0, fail())
 
 
-async def test_what_waits_too_long_is_cancelled_where_it_waits() -> None:
+async def test_work_is_cancelled_at_its_wait_after_the_timeout() -> None:
     cancelled = asyncio.Event()
 
     async def work() -> None:
@@ -94,7 +95,7 @@ async def test_a_cancellation_that_arrives_together_with_the_event_is_not_lost()
     task = asyncio.create_task(wait_for_ever())
     await asyncio.sleep(0.01)
     event.set()
-    # One turn of the loop later the waiting is done and not yet told: here `asyncio.wait_for` loses the cancellation.
+    # One turn of the loop later the wait is done but not yet reported: here `asyncio.wait_for` loses the cancellation.
     for _ in range(2):
         await asyncio.sleep(0)
     task.cancel()
@@ -103,7 +104,7 @@ async def test_a_cancellation_that_arrives_together_with_the_event_is_not_lost()
     assert task.cancelled()
 
 
-async def test_what_is_not_done_in_time_is_cancelled() -> None:
+async def test_unfinished_work_is_cancelled() -> None:
     cancelled = asyncio.Event()
 
     async def work() -> None:
@@ -115,3 +116,39 @@ async def test_what_is_not_done_in_time_is_cancelled() -> None:
     assert not await within(0.01, work())
     await asyncio.sleep(0)
     assert cancelled.is_set()
+
+
+async def test_a_clock_that_is_set_ends_each_kind_of_wait() -> None:
+    clock, event = SetClock(), asyncio.Event()
+    never = asyncio.get_running_loop().create_future()
+    waits = (
+        sleep(2.0, clock),
+        wait_set(event, 2.0, clock),
+        done_within(2.0, never, clock),
+        within(2.0, asyncio.Event().wait(), clock),
+    )
+    tasks = [asyncio.create_task(wait) for wait in waits]
+    while len(clock.timers) < len(tasks):
+        await asyncio.sleep(0)
+    clock.go_to(START_NS + 2 * S - 1)
+    for _ in range(3):
+        await asyncio.sleep(0)
+    assert not any(task.done() for task in tasks)
+    clock.go_to(START_NS + 2 * S)
+    assert await asyncio.gather(*tasks) == [None, None, False, False]
+    assert event.is_set()
+    assert not never.done()
+
+
+async def test_what_ends_sooner_takes_its_call_back() -> None:
+    clock, event, done = SetClock(), asyncio.Event(), asyncio.get_running_loop().create_future()
+    event.set()
+    done.set_result(None)
+    await wait_set(event, 2.0, clock)
+    assert await done_within(2.0, done, clock)
+    assert await within(2.0, event.wait(), clock)
+    cancelled = asyncio.create_task(sleep(2.0, clock))
+    await clock.waited_for()
+    cancelled.cancel()
+    await asyncio.gather(cancelled, return_exceptions=True)
+    assert clock.due_ns() is None

@@ -53,7 +53,7 @@ from shared.wire import (
 )
 
 LATE_NS = 10**9 * 3600 * 24 * 365
-"""A unit that has run for a year."""
+"""Time of a unit that has run for a year."""
 
 
 def update(**changes: Any) -> UpdateRequest:
@@ -86,12 +86,12 @@ def answer(**changes: Any) -> UpdateAnswer:
     return UpdateAnswer(**{**fields, **changes})
 
 
-def test_updates_come_back_as_they_went() -> None:
+def test_updates_round_trip() -> None:
     for one in (update(), update(captured_at_ns=None, exchange=None, keys=b"", health=Health(), done=())):
         assert decode_update(encode_update(one)) == one
 
 
-def test_answers_come_back_as_they_went() -> None:
+def test_answers_round_trip() -> None:
     changed = answer(
         settings=Settings(voxel_size_m=0.03),
         lattice=LatticeDescription(origin_m=(0.0, -1.5, 0.1), voxel_size_m=0.03, shape=(1, 2, 3)),
@@ -120,7 +120,7 @@ def test_an_update_costs_at_most_300_bytes_beyond_its_voxels() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 1000])
-def test_keys_come_back(count: int) -> None:
+def test_keys_round_trip(count: int) -> None:
     keys = np.sort(np.random.default_rng(1).choice(2**27, count, replace=False)).astype(np.uint32)
     found = keys_from_bytes(keys_to_bytes(keys), 2**27)
     assert found.dtype == np.uint32
@@ -152,7 +152,7 @@ def test_too_many_voxels_are_refused() -> None:
 
 
 @given(st.tuples(*[st.integers(1, 9)] * 3), st.integers(0, 2**32 - 1))
-def test_seen_grids_come_back(shape: tuple[int, int, int], seed: int) -> None:
+def test_seen_grids_round_trip(shape: tuple[int, int, int], seed: int) -> None:
     grid = np.random.default_rng(seed).random(shape) < 0.5
     report = pack_seen(grid, 0.1)
     assert report is not None
@@ -242,7 +242,7 @@ NO_MESSAGES = (b"", b"\xc1", b"\x90", b"\x81\x90\x01", b"\x93\x01", b"\xc0", b"{
 
 
 @pytest.mark.parametrize("data", NO_MESSAGES)
-def test_what_is_no_message_is_one_error(data: bytes) -> None:
+def test_invalid_messages_raise_one_error(data: bytes) -> None:
     for read in (decode_update, decode_update_answer):
         with pytest.raises(WireError):
             read(data)
@@ -295,16 +295,16 @@ def test_only_wire_errors_come_out_of_noise(data: bytes) -> None:
             continue
 
 
-def test_none_is_left_out_of_other_messages() -> None:
+def test_none_is_omitted_from_other_messages() -> None:
     body = encode(Health(trouble=None))
     assert "trouble" not in msgpack.unpackb(body)
     assert decode(Health, body) == Health()
 
 
-def test_names_of_strangers_are_not_kept_for_ever() -> None:
+def test_unknown_names_are_not_interned() -> None:
     name = "".join(["a name", " that nobody", " else uses"])
     (found,) = unpack(msgpack.packb({name: 1}), 100)
-    # The first of its kind that is interned, so none was before.
+    # The first name of its kind to be interned, so none was before.
     assert sys.intern(name) is name
     assert found == name
     assert found is not name
@@ -369,12 +369,12 @@ PLAIN = st.recursive(
 
 
 @given(UPDATES)
-def test_any_update_comes_back_as_it_went(sent: UpdateRequest) -> None:
+def test_any_update_round_trip(sent: UpdateRequest) -> None:
     assert decode_update(encode_update(sent)) == sent
 
 
 @given(ANSWERS)
-def test_any_answer_comes_back_as_it_went(sent: UpdateAnswer) -> None:
+def test_any_answer_round_trip(sent: UpdateAnswer) -> None:
     assert decode_update_answer(encode_update_answer(sent)) == sent
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,16 @@ from shared.messages import CONTRACT_MINOR, CONTRACT_VERSION, Health, Initialize
 from shared.timebase import Exchange
 from shared.wire import keys_to_bytes
 from tests.system.cluster import Cluster, write_cell
+
+pytestmark = pytest.mark.patient
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    folder = tmp_path_factory.mktemp("master")
+    with Cluster(folder, write_cell(folder)) as cluster:
+        cluster.start_master()
+        yield cluster
 
 
 class Counter:
@@ -44,46 +55,44 @@ class Counter:
 
 
 @pytest.mark.parametrize("count", [0, 100, 1000])
-async def test_an_update_and_its_answer_cost_at_most_4_bytes_a_voxel_and_800(tmp_path: Path, count: int) -> None:
-    with Cluster(tmp_path, write_cell(tmp_path)) as cluster:
-        await asyncio.to_thread(cluster.start_master)
-        counter = Counter(cluster.port)
-        proxy = await asyncio.start_server(counter.serve, "127.0.0.1", 0)
-        url = f"http://127.0.0.1:{proxy.sockets[0].getsockname()[1]}"
-        token = Path(cluster.unit_token_file).read_text().strip()
-        async with MasterClient(url, lambda: token) as client:
-            slot = await client.initialize(
-                InitializeRequest(
-                    contract=CONTRACT_VERSION,
-                    contract_minor=CONTRACT_MINOR,
-                    serial="A",
-                    intrinsics=Intrinsics(8, 6, 10.0, 10.0, 4.0, 3.0),
-                    sent_at_ns=monotonic_ns(),
-                )
+async def test_an_update_and_its_answer_cost_at_most_4_bytes_a_voxel_and_800(cluster: Cluster, count: int) -> None:
+    counter = Counter(cluster.port)
+    proxy = await asyncio.start_server(counter.serve, "127.0.0.1", 0)
+    url = f"http://127.0.0.1:{proxy.sockets[0].getsockname()[1]}"
+    token = Path(cluster.unit_token_file).read_text().strip()
+    async with MasterClient(url, lambda: token) as client:
+        slot = await client.initialize(
+            InitializeRequest(
+                contract=CONTRACT_VERSION,
+                contract_minor=CONTRACT_MINOR,
+                serial="A",
+                intrinsics=Intrinsics(8, 6, 10.0, 10.0, 4.0, 3.0),
+                sent_at_ns=monotonic_ns(),
             )
-            now_ns = monotonic_ns()
-            update = UpdateRequest(
-                id=slot.id,
-                session=slot.session,
-                sequence=10**6,
-                captured_at_ns=now_ns,
-                sent_at_ns=now_ns,
-                exchange=Exchange(now_ns, now_ns, now_ns, now_ns),
-                versions=slot.versions,
-                keys=keys_to_bytes(np.arange(count, dtype=np.uint32)),
-                health=Health(
-                    valid_share=0.87,
-                    agreeing_share=0.93,
-                    residual_share=0.01,
-                    static_share=0.5,
-                    process_ms=8.123,
-                    frame=10**6,
-                ),
-                joints_until_ns=now_ns,
-            )
-            counter.bytes = 0
-            await client.update(update)
-            assert 4 * count < counter.bytes <= 4 * count + 800
-        await counter.close()
-        proxy.close()
-        await proxy.wait_closed()
+        )
+        now_ns = monotonic_ns()
+        update = UpdateRequest(
+            id=slot.id,
+            session=slot.session,
+            sequence=10**6,
+            captured_at_ns=now_ns,
+            sent_at_ns=now_ns,
+            exchange=Exchange(now_ns, now_ns, now_ns, now_ns),
+            versions=slot.versions,
+            keys=keys_to_bytes(np.arange(count, dtype=np.uint32)),
+            health=Health(
+                valid_share=0.87,
+                agreeing_share=0.93,
+                residual_share=0.01,
+                static_share=0.5,
+                process_ms=8.123,
+                frame=10**6,
+            ),
+            joints_until_ns=now_ns,
+        )
+        counter.bytes = 0
+        await client.update(update)
+        assert 4 * count < counter.bytes <= 4 * count + 800
+    await counter.close()
+    proxy.close()
+    await proxy.wait_closed()

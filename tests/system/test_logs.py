@@ -17,6 +17,7 @@ from tests.system.cluster import Cluster, write_cell
 REFUSED = "some-other-token-0123456789"
 
 
+@pytest.mark.patient
 @pytest.mark.parametrize("level", ["INFO", "DEBUG"])
 def test_no_line_holds_a_token(tmp_path: Path, level: str) -> None:
     with Cluster(tmp_path, write_cell(tmp_path)) as cluster:

@@ -22,6 +22,7 @@ from shared.transforms import angle_rad, from_rotation_translation, identity, in
 from simulation.cameras.board_picture import BoardCamera, BoardPicture
 from simulation.cameras.camera import rig
 from simulation.world.world import DEMO_CELL, World
+from tests.set_clock import S, SetClock
 
 CAMERA = Intrinsics(640, 480, 600.0, 600.0, 320.0, 240.0)
 BOARD = Board("grid", 3, 4, 0.08, 0.06, "DICT_4X4_50", 0, identity())
@@ -80,26 +81,29 @@ async def test_an_uncertain_pose_takes_more_images(monkeypatch: pytest.MonkeyPat
 
 
 async def test_without_a_board_it_scans_with_growing_pauses() -> None:
-    source = Pictures(EMPTY)
-    search = BoardSearch(source, "infrared")
-    assert search.due(monotonic_ns())
+    source, clock = Pictures(EMPTY), SetClock()
+    search = BoardSearch(source, "infrared", clock)
+    assert search.due
     with pytest.raises(BoardError, match="none of the board's 12 markers"):
         await search.scan(BOARD, lambda seen: None)
     assert source.taken == EMPTY_FRAMES - 1
-    after_ns = monotonic_ns()
-    assert not search.due(after_ns)
-    assert search.due(after_ns + round(RETRY_MIN_S * 1e9))
+    first_ns = clock.now + round(RETRY_MIN_S * S)
+    clock.go_to(first_ns - 1)
+    assert not search.due
+    clock.go_to(first_ns)
+    assert search.due
     with pytest.raises(BoardError):
         await search.scan(BOARD, lambda seen: None)
-    assert not search.due(monotonic_ns() + round(1.5 * RETRY_MIN_S * 1e9))
+    clock.go_to(first_ns + 2 * round(RETRY_MIN_S * S) - 1)
+    assert not search.due
     assert "none of the board's" in search.outcome
     search.begin_anew()
-    assert search.due(0)
+    assert search.due
 
 
 async def test_a_source_without_images() -> None:
     search = BoardSearch(object(), "infrared")
-    assert not search.due(monotonic_ns())
+    assert not search.due
     with pytest.raises(BoardError, match="no images"):
         await search.scan(BOARD, lambda seen: None)
     with pytest.raises(SourceError, match="delivered no image"):

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The daemon with a real pipeline and a real master, both in this process, and a camera that shows what we want."""
+"""The daemon with a real pipeline and a real master, both in this process, by a clock that the tests set.
+
+The camera shows what a test wants. Frames are worked on in threads, so a test waits for them by the real clock; but
+nothing here is measured by it, and no wait of the unit's ends by it.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +22,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from edge_unit.calibration import board_scan as board_search_module
 from edge_unit.calibration.board_layout import BoardLayout
+from edge_unit.calibration.board_scan import RETRY_MIN_S
 from edge_unit.config import PoseConfig, UnitConfig
 from edge_unit.daemon import report as reporting_module
 from edge_unit.daemon import unit as unit_module
 from edge_unit.daemon.frame_processor import FrameProcessor
 from edge_unit.daemon.joint_lookup import FrameJoints
 from edge_unit.daemon.refinement_task import REFINE_FRAMES
-from edge_unit.daemon.unit import Unit
+from edge_unit.daemon.unit import FRAME_S_MAX, Unit
 from edge_unit.daemon.warm_up import warm_up_kernels
 from edge_unit.monitoring import read_trace
 from edge_unit.sources.frame import CameraInfo, DepthFrame
@@ -34,23 +38,26 @@ from edge_unit.sources.image import ImageFrame, ImageInfo, ImageStream
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from edge_unit.uplink.client import MasterClient
 from edge_unit.uplink.outbox import HEARTBEAT_S
+from edge_unit.uplink.uplink import RETRY_MAX_S
+from master_server.api.routes import images, robot, units, update
 from master_server.app import make_app
 from master_server.core import Master
+from master_server.core.master import MapView
 from master_server.core.units import Slot
 from master_server.security import Access
 from shared.camera import Intrinsics
 from shared.cell import Board
-from shared.clock import NS_PER_S, monotonic_ns
+from shared.clock import monotonic_ns
 from shared.errors import SourceError
-from shared.messages import CommandRow, JointsRequest, OutcomeCode, UnitRow, Verb
+from shared.messages import Command, CommandRow, JointsRequest, OutcomeCode, UnitRow, Verb
 from shared.settings import Settings
 from shared.transforms import from_xyz_rpy, inverse
+from shared.waiting import LOOP_CLOCK, Clock
 from simulation.cameras.board_picture import BoardPicture
 from tests.edge_unit import scenes
 from tests.master_server.fakes import cell as make_cell
 from tests.master_server.fakes import master as make_master
-
-pytestmark = pytest.mark.alone
+from tests.set_clock import MS, S, SetClock
 
 TOKEN = "unit-token-0123456789"
 IP = "10.0.0.1"
@@ -58,9 +65,22 @@ IP = "10.0.0.1"
 CAMERA = Intrinsics(64, 48, 60.0, 60.0, 31.5, 23.5, stereo_baseline_m=1.0)
 FAR_MM = 5000
 
+MASTER_MODULES = (images, robot, units, update)
+"""Of the master's, those that read the time for a unit."""
+
+HEARTBEAT_NS = round(HEARTBEAT_S * S)
+RETRY_NS = round(1.2 * RETRY_MAX_S * S)
+"""The longest wait of the uplink."""
+
+FRAME_NS = 33 * MS
+
 # Above the box of 1 m, 2 m, 0.5 m, looking straight down at its middle.
 ABOVE = PoseConfig(xyz=(0.5, 1.0, 1.5), rpy_deg=(180.0, 0.0, 0.0))
 BESIDE = PoseConfig(xyz=(0.5, 1.5, 1.5), rpy_deg=(180.0, 0.0, 0.0))
+
+
+PATIENCE_S = 60
+"""For a frame on a busy machine; by the real clock, and so never measured."""
 
 
 def patch(depth_mm: int, column: int = 24) -> NDArray[np.uint16]:
@@ -77,9 +97,10 @@ def compiled() -> None:
 
 
 class FakeSource:
-    """Delivers what a test puts into it; an exception is raised, None is the end."""
+    """Delivers what a test puts into it, a frame's period later; an exception is raised, None is the end."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
         self.queue: asyncio.Queue[NDArray[np.uint16] | Exception | None] = asyncio.Queue()
         self.serial = "A"
         self.camera = CAMERA
@@ -99,7 +120,9 @@ class FakeSource:
                 return
             if isinstance(item, Exception):
                 raise item
-            yield DepthFrame(item, monotonic_ns(), self.number, self.joints)
+            if isinstance(self.clock, SetClock):
+                self.clock.go_to(self.clock.now + FRAME_NS)
+            yield DepthFrame(item, self.clock.now_ns(), self.number, self.joints)
             self.number += 1
 
     async def close(self) -> None:
@@ -109,8 +132,11 @@ class FakeSource:
 class Bench:
     """One master, one unit, one source."""
 
-    def __init__(self, folder: Path, with_robot: bool = False, **config: Any) -> None:
-        self.source = FakeSource()
+    def __init__(self, folder: Path, with_robot: bool = False, real_clock: bool = False, **config: Any) -> None:
+        self.clock = SetClock()
+        self.unit_clock: Clock = LOOP_CLOCK if real_clock else self.clock
+        self.answered = 0
+        self.source = FakeSource(self.unit_clock)
         self.serve(make_master(with_robot, stale_after_s=60.0))
         fields = {"T_world_camera": ABOVE, "state_dir": folder, "token": TOKEN, **config}
         # Which source is configured decides only what happens when it fails.
@@ -123,39 +149,85 @@ class Bench:
         self.app = make_app(master, Access(TOKEN.encode(), b"operator-token-0123456789"))
 
     def make_unit(self) -> Unit:
-        transport = httpx.ASGITransport(app=lambda *call: self.app(*call), client=(IP, 40_000))
+        transport = httpx.ASGITransport(app=self._answer, client=(IP, 40_000))
         client = MasterClient("http://master", lambda: TOKEN, transport=transport)
-        return Unit(self.config, self.source, client)
+        return Unit(self.config, self.source, client, self.unit_clock)
+
+    async def _answer(self, *call: Any) -> None:
+        await self.app(*call)
+        self.answered += 1
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[asyncio.Task[None]]:
-        self.task = task = asyncio.create_task(self.unit.run())
-        try:
-            yield task
-        finally:
-            task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
+        with pytest.MonkeyPatch.context() as patch:
+            for module in MASTER_MODULES:
+                patch.setattr(module, "monotonic_ns", self.unit_clock.now_ns)
+            self.task = task = asyncio.create_task(self.unit.run())
+            try:
+                yield task
+            finally:
+                task.cancel()
+                with contextlib.suppress(asyncio.CancelledError):
+                    await task
 
     def show(self, depth: NDArray[np.uint16] | Exception | None) -> None:
         self.source.queue.put_nowait(depth)
 
     def row(self) -> UnitRow | None:
-        rows = self.master.units(monotonic_ns())
+        rows = self.master.units(self.unit_clock.now_ns())
         return rows[0] if rows else None
 
     def voxels(self) -> set[tuple[int, ...]]:
-        view = self.master.view(monotonic_ns())
+        view = self.view()
         return {tuple(index) for index in view.lattice.indices(view.keys).tolist()}
 
-    async def until(self, look: Callable[[], Any], what: str, timeout_s: float = 20.0) -> Any:
-        deadline_ns = monotonic_ns() + round(timeout_s * 1e9)
+    def view(self) -> MapView:
+        return self.master.view(self.unit_clock.now_ns())
+
+    def ask(self, verb: Verb) -> Command:
+        """Ask unit 1 for something, as an operator does."""
+        return self.master.ask(1, verb, self.unit_clock.now_ns())
+
+    async def until(self, look: Callable[[], Any], what: str, *, beating: bool = False) -> Any:
+        """Wait until threads and requests have come so far that `look` finds something.
+
+        The clock stands meanwhile; with `beating` it goes on from one wait of the uplink to the next.
+        """
+        deadline_ns = monotonic_ns() + PATIENCE_S * S
         while not (found := look()):
             if self.task.done():
                 await self.task
             assert monotonic_ns() < deadline_ns, f"{what}: {self.row()}"
+            due_ns = self.clock.due_ns() if beating else None
+            if due_ns is not None and due_ns <= self.clock.now + RETRY_NS:
+                self.clock.step()
             await asyncio.sleep(0.002)
         return found
+
+    async def beat(self) -> None:
+        """Let the uplink's heartbeat come, and wait until it has followed the answer and waits for the next."""
+        await self.until(lambda: self.clock.due_ns() is not None, "the wait for a heartbeat")
+        before = self.answered
+        self.clock.go_to(self.clock.now + HEARTBEAT_NS)
+        await self.until(lambda: self.answered > before and self.clock.due_ns() is not None, "a heartbeat")
+
+    async def pass_time(self, seconds: float) -> None:
+        """Let so much time pass, from one call of the clock to the next."""
+        end_ns = self.clock.now + round(seconds * S)
+        while True:
+            await self.until(lambda: self.clock.due_ns() is not None, "a wait of the unit's")
+            due_ns = self.clock.due_ns()
+            if due_ns is None or due_ns > end_ns:
+                break
+            self.clock.step()
+        self.clock.go_to(end_ns)
+
+    async def ask_and_hear(self, verb: Verb) -> Command:
+        """Ask unit 1 for something, and wait until it has heard of it."""
+        command = self.ask(verb)
+        await self.beat()
+        assert not self.unit.uplink.commands.empty()
+        return command
 
     async def until_state(self, state: str) -> UnitRow:
         found = await self.until(lambda: (row := self.row()) is not None and row.state == state and row, state)
@@ -174,10 +246,10 @@ async def test_from_frame_to_map(tmp_path: Path) -> None:
         assert row.voxels == len(bench.voxels())
         assert row.health.valid_share == 1.0
         assert row.process_ms > 0.0
-        assert bench.master.view(monotonic_ns()).complete
+        assert bench.view().complete
         bench.show(patch(FAR_MM))
         await bench.until(lambda: not bench.voxels(), "an empty map")
-        assert bench.master.view(monotonic_ns()).complete
+        assert bench.view().complete
     assert bench.source.closed >= 1
 
 
@@ -191,7 +263,7 @@ async def test_of_too_many_voxels_the_nearest_are_reported_and_the_rest_is_not_s
     async with bench.running():
         bench.show(depth)
         row = await bench.until_state("live")
-        everything, all_seen = bench.voxels(), bench.master.seen_by(monotonic_ns())
+        everything, all_seen = bench.voxels(), bench.master.seen_by(bench.clock.now)
         assert row.reason == ""
         near = {index for index in everything if index[2] == 9}
         assert 20 <= len(near) < len(everything)
@@ -203,18 +275,18 @@ async def test_of_too_many_voxels_the_nearest_are_reported_and_the_rest_is_not_s
         row = await bench.until(lambda: (row := bench.row()) and row.reason and row, "a warning")
         assert (row.state, row.reason) == ("live", warning)
         assert bench.voxels() == near
-        seen = bench.master.seen_by(monotonic_ns())
+        seen = bench.master.seen_by(bench.clock.now)
         assert (seen <= all_seen).all()
         for x, y, z in everything - near:
             assert seen[x // 2, y // 2, z // 2] == 0
-        assert bench.master.view(monotonic_ns()).complete
+        assert bench.view().complete
 
 
 async def test_a_frame_that_hangs_is_told_and_waiting_for_a_camera_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench = await asyncio.to_thread(Bench, tmp_path)
-    release = threading.Event()
+    entered, release = threading.Event(), threading.Event()
     async with bench.running():
         bench.show(patch(1225))
         await bench.until_state("live")
@@ -222,16 +294,20 @@ async def test_a_frame_that_hangs_is_told_and_waiting_for_a_camera_is_not(
         assert "unit 1 at http://master" in bench.unit.status()
         bench.show(SourceError("it was unplugged"))
         await bench.until(lambda: "it was unplugged" in bench.unit.status(), "a camera that is gone")
-        monkeypatch.setattr(unit_module, "FRAME_S_MAX", 0.05)
-        await asyncio.sleep(0.1)
+        await bench.pass_time(2.0 * FRAME_S_MAX)
         assert bench.unit.stuck() is None
         await bench.until(lambda: bench.source.opened >= 2, "a camera that is opened again")
         bench.show(patch(1225))
         await bench.until(lambda: (row := bench.row()) and row.health.frame == 1, "a frame")
-        monkeypatch.setattr(FrameProcessor, "process", lambda *_: release.wait(30.0))
+        monkeypatch.setattr(FrameProcessor, "process", lambda *_: entered.set() or release.wait(PATIENCE_S))
         bench.show(patch(1225))
-        stuck = await bench.until(bench.unit.stuck, "a frame that hangs")
-        assert stuck.startswith("frame 2 has not finished for 0 s")
+        await bench.until(entered.is_set, "a frame that is begun")
+        bench.clock.go_to(bench.clock.now + round(FRAME_S_MAX * S))
+        assert bench.unit.stuck() is None
+        bench.clock.go_to(bench.clock.now + 1 * S)
+        stuck = bench.unit.stuck()
+        assert stuck is not None
+        assert stuck.startswith(f"frame 2 has not finished for {FRAME_S_MAX + 1.0:.0f} s")
         release.set()
 
 
@@ -265,7 +341,7 @@ async def test_settings_cell_and_pose_change_while_it_runs(tmp_path: Path) -> No
         before = bench.voxels()
         bench.master.change_settings({"voxel_size_m": 0.1})
         assert bench.voxels() == set()
-        await asyncio.sleep(2.0 * HEARTBEAT_S)
+        await bench.beat()
         bench.show(patch(1225))
         await bench.until_state("live")
         coarse = bench.voxels()
@@ -273,7 +349,7 @@ async def test_settings_cell_and_pose_change_while_it_runs(tmp_path: Path) -> No
         assert {index[2] for index in coarse} == {2}
 
         bench.master.set_pose(1, _matrix(BESIDE), "operator", None)
-        await asyncio.sleep(2.0 * HEARTBEAT_S)
+        await bench.beat()
         bench.show(patch(1225))
         await bench.until_state("live")
         assert {(x, y + 5, z) for x, y, z in coarse} == bench.voxels()
@@ -292,7 +368,7 @@ async def test_without_a_pose_it_waits_for_one(tmp_path: Path) -> None:
         await bench.until_state("uncalibrated")
         assert bench.voxels() == set()
         bench.master.set_pose(1, _matrix(ABOVE), "operator", None)
-        await asyncio.sleep(2.0 * HEARTBEAT_S)
+        await bench.beat()
         bench.show(patch(1225))
         await bench.until_state("live")
         assert bench.voxels()
@@ -307,10 +383,14 @@ async def test_a_camera_that_fails_is_opened_again_and_its_trouble_told(
         bench.show(patch(1225))
         await bench.until_state("live")
         bench.show(SourceError("unplugged"))
+        await bench.until(lambda: bench.source.closed == 1, "the camera closed")
+        await bench.beat()
         row = await bench.until_state("blind")
         assert row.cause is not None
         assert row.cause.code == "camera"
         assert "unplugged" in row.reason
+        assert bench.source.opened == 1
+        await bench.pass_time(0.3)
         bench.show(patch(1225))
         await bench.until_state("live")
         assert bench.source.opened == 2
@@ -327,7 +407,10 @@ async def test_another_camera_registers_anew_and_its_pose_is_void(tmp_path: Path
         bench.unit._camera.known_pose = None
         bench.source.serial = "B"
         bench.show(SourceError("unplugged"))
-        row = await bench.until_state("uncalibrated")
+        await bench.until(lambda: bench.source.closed == 1, "the camera closed")
+        row = await bench.until(
+            lambda: (row := bench.row()) and row.state == "uncalibrated" and row, "another unit", beating=True
+        )
         assert row.serial == "B"
         assert "changed from A to B" in row.reason
 
@@ -339,7 +422,9 @@ async def test_a_forgotten_unit_comes_back(tmp_path: Path) -> None:
         await bench.until_state("live")
         bench.master.forget(1)
         bench.show(patch(1225))
-        row = await bench.until(lambda: (row := bench.row()) and row.arrival_age_s is not None and row, "registered")
+        row = await bench.until(
+            lambda: (row := bench.row()) and row.arrival_age_s is not None and row, "registered", beating=True
+        )
         assert row.id == 2
         bench.show(patch(1225))
         await bench.until_state("live")
@@ -352,8 +437,9 @@ async def test_another_master_never_gets_voxels_of_the_first_ones_lattice(tmp_pa
         await bench.until_state("live")
         # All version numbers begin at 1 again, and mean another lattice.
         bench.serve(make_master(voxel_size_m=0.1, stale_after_s=60.0))
-        await bench.until(bench.row, "registered")
-        await asyncio.sleep(3.0 * HEARTBEAT_S)
+        await bench.until(bench.row, "registered", beating=True)
+        for _ in range(3):
+            await bench.beat()
         assert bench.voxels() == set()
         bench.show(patch(1225))
         await bench.until_state("live")
@@ -375,8 +461,8 @@ async def test_joints_of_the_frames_time_reach_the_pipeline(tmp_path: Path, monk
         await bench.until(lambda: used, "a frame without joints")
         assert used[-1] is None
         for step in range(3):
-            bench.master.put_joints(JointsRequest(positions=(0.5, 0.1 * step)), monotonic_ns())
-            await asyncio.sleep(0.01)
+            bench.master.put_joints(JointsRequest(positions=(0.5, 0.1 * step)), bench.clock.now)
+            bench.clock.go_to(bench.clock.now + 10 * MS)
         bench.show(patch(FAR_MM))
         await bench.until(lambda: len(used) == 2, "a frame with joints")
         assert used[-1].positions[0] == pytest.approx(0.5)
@@ -392,10 +478,10 @@ async def test_joints_whose_times_are_late_are_looked_up_later(tmp_path: Path, m
     bench = await asyncio.to_thread(Bench, tmp_path, with_robot=True)
     ahead_s: list[float | None] = []
     report = FrameProcessor._report
-    began_ns = monotonic_ns()
+    began_ns = bench.clock.now
 
     def turned(at_ns: int) -> float:
-        return (at_ns - began_ns) / NS_PER_S
+        return (at_ns - began_ns) / S
 
     def spy(work: Any, pipeline: Any, assignment: Any, frame: Any, joints: Any, stages: Any) -> Any:
         ahead_s.append(None if joints is None else joints.positions[1] - turned(frame.captured_at_ns))
@@ -407,7 +493,7 @@ async def test_joints_whose_times_are_late_are_looked_up_later(tmp_path: Path, m
     async def ahead() -> float:
         """Of a frame for which joints are known: the first may come long after them, while kernels are compiled."""
         while True:
-            count, at_ns = len(ahead_s), monotonic_ns()
+            count, at_ns = len(ahead_s), bench.clock.now
             request = JointsRequest(positions=(0.0, turned(at_ns)), velocities=(0.0, 1.0), at_ns=at_ns)
             bench.master.put_joints(request, at_ns)
             bench.show(patch(FAR_MM))
@@ -417,14 +503,12 @@ async def test_joints_whose_times_are_late_are_looked_up_later(tmp_path: Path, m
 
     monkeypatch.setattr(FrameProcessor, "_report", spy)
     async with bench.running():
-        assert await ahead() == pytest.approx(0.0, abs=0.02)
+        assert await ahead() == pytest.approx(0.0, abs=1e-3)
         bench.master.change_settings({"joint_delay_s": 0.05})
-        version = bench.master.versions.settings
-        await bench.until(
-            lambda: bench.unit.uplink.assignment and bench.unit.uplink.assignment.versions.settings == version,
-            "the new settings",
-        )
-        assert await ahead() == pytest.approx(0.05, abs=0.02)
+        await bench.beat()
+        assert bench.unit.uplink.assignment is not None
+        assert bench.unit.uplink.assignment.settings.joint_delay_s == 0.05
+        assert await ahead() == pytest.approx(0.05, abs=1e-3)
 
 
 async def test_no_frame_waits_for_the_look_at_the_joints_delay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -441,7 +525,7 @@ async def test_no_frame_waits_for_the_look_at_the_joints_delay(tmp_path: Path, m
 
     async def report(number: int) -> None:
         """Show a frame and wait for its report."""
-        at_ns = monotonic_ns()
+        at_ns = bench.clock.now
         bench.master.put_joints(JointsRequest(positions=(0.0, 0.1), velocities=(0.0, 0.0), at_ns=at_ns), at_ns)
         bench.show(patch(FAR_MM))
         await bench.until(
@@ -494,8 +578,7 @@ async def test_the_background_is_learned_kept_and_used_again(tmp_path: Path) -> 
         bench.show(patch(1225))
         await bench.until(lambda: (row := bench.row()) and row.frame_number == 5, "the next frame")
         assert bench.voxels() == set()
-        command = bench.master.ask(1, "drop_background", monotonic_ns())
-        await asyncio.sleep(2.0 * HEARTBEAT_S)
+        command = await bench.ask_and_hear("drop_background")
         bench.show(patch(1225))
         await bench.until(bench.voxels, "no background")
         done = CommandRow(id=command.id, verb="drop_background", outcome="done", code="done")
@@ -504,8 +587,7 @@ async def test_the_background_is_learned_kept_and_used_again(tmp_path: Path) -> 
 
 async def outcome_of(bench: Bench, verb: Verb) -> CommandRow:
     """What becomes of a command that the next frame answers."""
-    command = bench.master.ask(1, verb, monotonic_ns())
-    await bench.until(lambda: not bench.unit.uplink.commands.empty(), f"{verb} reached the unit")
+    command = await bench.ask_and_hear(verb)
     bench.show(patch(1225))
     row = await bench.until(
         lambda: (row := bench.row()) and row.last_command and row.last_command.outcome and row, f"outcome of {verb}"
@@ -519,13 +601,15 @@ async def outcome_of(bench: Bench, verb: Verb) -> CommandRow:
 async def test_what_a_unit_cannot_do_it_says(tmp_path: Path) -> None:
     bench = await asyncio.to_thread(Bench, tmp_path, T_world_camera=None)
     async with bench.running():
+        await bench.until(lambda: bench.unit.uplink.assignment, "a registration")
         await bench.until_state("uncalibrated")
         refused = await outcome_of(bench, "drop_background")
         assert refused.code == "refused"
         assert "pose" in refused.detail
         assert refused.outcome == refused.detail
         bench.master.set_pose(1, _matrix(ABOVE), "operator", None)
-        await bench.until(lambda: bench.unit.uplink.assignment.T_world_camera is not None, "the pose")
+        await bench.beat()
+        assert bench.unit.uplink.assignment.T_world_camera is not None
         assert (await outcome_of(bench, "drop_background")).code == "done"
 
 
@@ -543,8 +627,7 @@ class RefineBench(Bench):
 
     async def refine(self) -> CommandRow:
         """Ask for it, show frames, and wait for what became of it."""
-        asked = self.master.ask(1, "refine", monotonic_ns())
-        await self.until(lambda: not self.unit.uplink.commands.empty(), "the command")
+        asked = await self.ask_and_hear("refine")
         for _ in range(REFINE_FRAMES):
             self.show(self.frame)
 
@@ -553,7 +636,7 @@ class RefineBench(Bench):
             last = row.last_command if row else None
             return last if last is not None and last.id == asked.id and last.outcome is not None else None
 
-        found = await self.until(told, "what became of it")
+        found = await self.until(told, "what became of it", beating=True)
         assert isinstance(found, CommandRow)
         return found
 
@@ -601,16 +684,14 @@ async def test_who_asked_for_a_background_is_told_when_it_is_given_up(tmp_path: 
     async with bench.running():
         bench.show(patch(1225))
         await bench.until_state("live")
-        learn = bench.master.ask(1, "learn_background", monotonic_ns())
-        await bench.until(lambda: not bench.unit.uplink.commands.empty(), "the command")
+        learn = await bench.ask_and_hear("learn_background")
         bench.show(patch(1225))
         row = await bench.until_state("blind")
         assert row.last_command == CommandRow(id=learn.id, verb="learn_background", outcome=None)
         ended: list[tuple[int, OutcomeCode]] = []
         with pytest.MonkeyPatch.context() as monkey:
             monkey.setattr(Slot, "end", lambda slot, command_id, outcome: ended.append((command_id, outcome.code)))
-            bench.master.ask(1, "drop_background", monotonic_ns())
-            await bench.until(lambda: not bench.unit.uplink.commands.empty(), "the other command")
+            await bench.ask_and_hear("drop_background")
             bench.show(patch(1225))
             await bench.until(lambda: ended, "both outcomes")
         assert (learn.id, "superseded") in ended
@@ -618,22 +699,21 @@ async def test_who_asked_for_a_background_is_told_when_it_is_given_up(tmp_path: 
 
 async def test_frames_beyond_the_rate_are_passed_over(tmp_path: Path) -> None:
     bench = await asyncio.to_thread(Bench, tmp_path, fps_max=1.0, trace_path=tmp_path / "trace")
-    async with bench.running():
+    async with bench.running() as task:
         for _ in range(5):
             bench.show(patch(1225))
         bench.show(None)
-        await asyncio.sleep(0.0)
-        await bench.until_state("live")
+        await asyncio.wait_for(task, PATIENCE_S)
     assert [record.frame_number for record in await asyncio.to_thread(read_trace, tmp_path / "trace")] == [0]
 
 
 async def test_at_the_end_of_a_recording_the_last_frame_is_merged(tmp_path: Path) -> None:
-    bench = await asyncio.to_thread(Bench, tmp_path, trace_path=tmp_path / "trace")
+    bench = await asyncio.to_thread(Bench, tmp_path, real_clock=True, trace_path=tmp_path / "trace")
     async with bench.running() as task:
         for _ in range(3):
             bench.show(patch(1225))
         bench.show(None)
-        await asyncio.wait_for(task, 20.0)
+        await asyncio.wait_for(task, PATIENCE_S)
     records = await asyncio.to_thread(read_trace, tmp_path / "trace")
     assert [record.frame_number for record in records] == [0, 1, 2]
     last = records[-1]
@@ -656,8 +736,9 @@ async def test_pictures_are_drawn_when_someone_asks(tmp_path: Path) -> None:
 
     async def picture(client: httpx.AsyncClient, path: str) -> httpx.Response:
         asking = asyncio.ensure_future(client.get(f"/units/1/images/{path}"))
-        await bench.until(lambda: not bench.unit.uplink.commands.empty(), "asked")
+        await bench.until(lambda: not bench.unit.uplink.commands.empty(), "asked", beating=True)
         bench.show(patch(1225))
+        await bench.until(asking.done, "the answer", beating=True)
         return await asking
 
     async with bench.running(), httpx.AsyncClient(transport=transport, base_url="http://m", headers=headers) as client:
@@ -668,14 +749,15 @@ async def test_pictures_are_drawn_when_someone_asks(tmp_path: Path) -> None:
         refused = await picture(client, "expected")
         assert (refused.status_code, "its camera is not known" in refused.text) == (409, True)
         bench.master.set_pose(1, _matrix(ABOVE), "operator", None)
-        await bench.until(lambda: bench.unit.uplink.assignment.T_world_camera is not None, "the pose")
+        await bench.beat()
+        assert bench.unit.uplink.assignment.T_world_camera is not None
         left = await picture(client, "foreground?raw=1")
         found = cv2.imdecode(np.frombuffer(left.content, np.uint8), cv2.IMREAD_UNCHANGED)
         assert set(np.unique(found).tolist()) == {FAR_MM, 1225}
         coloured = await picture(client, "expected")
         assert cv2.imdecode(np.frombuffer(coloured.content, np.uint8), cv2.IMREAD_UNCHANGED).shape == (48, 64, 3)
         await bench.until_state("live")
-        await bench.until(lambda: not bench.master.registry.get(1).asked, "all told")
+        await bench.until(lambda: not bench.master.registry.get(1).asked, "all told", beating=True)
 
 
 BOARD = Board("grid", 3, 4, 0.08, 0.06, "DICT_4X4_50", 0, from_xyz_rpy((0.4, 1.1, 0.0), (np.pi, 0.0, 0.0)))
@@ -685,8 +767,8 @@ BOARD_CAMERA = Intrinsics(640, 480, 600.0, 600.0, 320.0, 240.0)
 class LookingSource(FakeSource):
     """Shows the board, when there is one, as from `ABOVE`; depth waits meanwhile."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, clock: Clock) -> None:
+        super().__init__(clock)
         picture = BoardPicture(BoardLayout.of(BOARD), BOARD_CAMERA)
         seen = picture.expose(inverse(ABOVE.transform()) @ BOARD.T_world_board)
         self.with_board = picture.develop(seen, np.random.default_rng(0))
@@ -701,22 +783,19 @@ class LookingSource(FakeSource):
 
     async def images(self) -> AsyncGenerator[ImageFrame, None]:
         for number in range(100):
-            yield ImageFrame(self.with_board if self.mounted else self.with_board * 0, monotonic_ns(), number)
+            yield ImageFrame(self.with_board if self.mounted else self.with_board * 0, self.clock.now_ns(), number)
 
 
 def looking_bench(folder: Path, **config: Any) -> tuple[Bench, LookingSource]:
     bench = Bench(folder, **{"T_world_camera": None, **config})
     bench.serve(Master(replace(make_cell(), board=BOARD), Settings(stale_after_s=60.0)))
-    source = LookingSource()
+    source = LookingSource(bench.clock)
     bench.source = source
     bench.unit = bench.make_unit()
     return bench, source
 
 
-async def test_without_a_pose_it_looks_for_the_board_until_it_is_mounted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(board_search_module, "RETRY_MIN_S", 0.01)
+async def test_without_a_pose_it_looks_for_the_board_until_it_is_mounted(tmp_path: Path) -> None:
     bench, source = await asyncio.to_thread(looking_bench, tmp_path)
     async with bench.running():
         bench.show(patch(1225))
@@ -724,7 +803,7 @@ async def test_without_a_pose_it_looks_for_the_board_until_it_is_mounted(
         assert row.state == "uncalibrated"
         assert row.reason.startswith("looking for the board: none of the board's 12 markers was seen in")
         source.mounted = True
-        await asyncio.sleep(0.05)
+        bench.clock.go_to(bench.clock.now + round(RETRY_MIN_S * S))
         bench.show(patch(1225))
         row = await bench.until(lambda: (row := bench.row()) and row.T_world_camera and row, "its pose")
         assert np.abs(np.array(row.T_world_camera) - ABOVE.transform()).max() < 5e-3
@@ -745,18 +824,18 @@ async def test_it_looks_for_the_board_when_asked_even_if_it_has_a_pose(tmp_path:
         bench.show(patch(1225))
         await bench.until_state("live")
         assert source.looks == 0
-        bench.master.ask(1, "calibrate", monotonic_ns())
-        await asyncio.sleep(2.0 * HEARTBEAT_S)
+        await bench.ask_and_hear("calibrate")
         bench.show(patch(1225))
-        row = await bench.until(lambda: (row := bench.row()) and row.last_command.outcome and row, "its outcome")
+        row = await bench.until(lambda: (row := bench.row()) and row.last_command.outcome and row, "done", beating=True)
         assert row.last_command.code == "done"
         assert np.abs(np.array(row.T_world_camera) - ABOVE.transform()).max() < 5e-3
         source.mounted = False
-        bench.master.ask(1, "calibrate", monotonic_ns())
-        await asyncio.sleep(2.0 * HEARTBEAT_S)
+        await bench.ask_and_hear("calibrate")
         bench.show(patch(1225))
         row = await bench.until(
-            lambda: (row := bench.row()) and row.last_command.id == 2 and row.last_command.outcome and row, "2"
+            lambda: (row := bench.row()) and row.last_command.id == 2 and row.last_command.outcome and row,
+            "2",
+            beating=True,
         )
         assert row.last_command.code == "failed"
         assert "12 markers" in row.last_command.detail

@@ -6,20 +6,25 @@ import pytest
 from edge_unit.daemon.frame_limiter import FrameLimiter
 from edge_unit.daemon.unit_status import UnitStatus
 from shared.clock import NS_PER_MS, NS_PER_S
+from tests.set_clock import SetClock
 
 
 def test_trouble_comes_before_frames_a_second_and_the_camera_s_first(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    status = UnitStatus(0)
-    assert status.line(None, NS_PER_S) == "no frame yet"
+    clock = SetClock(0)
+    status = UnitStatus(clock)
+    clock.go_to(NS_PER_S)
+    assert status.line(None) == "no frame yet"
     for _ in range(30):
         status.note_frame(None)
-    assert status.line("camera: it is absent", 2 * NS_PER_S) == "camera: it is absent"
+    clock.go_to(2 * NS_PER_S)
+    assert status.line("camera: it is absent") == "camera: it is absent"
     for _ in range(15):
         status.note_frame(None)
-    assert status.line(None, 3 * NS_PER_S) == "live, 15.0 fps"
+    clock.go_to(3 * NS_PER_S)
+    assert status.line(None) == "live, 15.0 fps"
     status.note_frame("joints: expected 6, got 5")
-    assert status.line(None, 4 * NS_PER_S) == "joints: expected 6, got 5"
+    assert status.line(None) == "joints: expected 6, got 5"
     assert caplog.messages == ["frames are filtered and reported", "joints: expected 6, got 5"]
 
 

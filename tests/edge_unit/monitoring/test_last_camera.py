@@ -29,7 +29,7 @@ def test_the_last_one_is_remembered(tmp_path: Path) -> None:
 def test_a_damaged_file_is_as_good_as_none(tmp_path: Path, text: str, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "camera.json").write_text(text)
     assert CameraMemory(tmp_path).load() is None
-    assert "camera.json: passed over" in caplog.text
+    assert "camera.json: ignored" in caplog.text
 
 
 def test_a_failed_write_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import pytest
-
 from edge_unit.monitoring import StageTimer
-from edge_unit.monitoring import stage_timer as module
+from tests.set_clock import SetClock
 
 
-def test_stages_follow_one_another_and_parts_are_listed_separately(monkeypatch: pytest.MonkeyPatch) -> None:
-    now_ns = iter((1_010, 1_050))
-    monkeypatch.setattr(module, "monotonic_ns", lambda: next(now_ns))
-    stages = StageTimer(1_000)
+def test_stages_follow_one_another_and_parts_are_told_apart() -> None:
+    clock = SetClock(1_010)
+    stages = StageTimer(1_000, clock)
     stages.end("source")
+    clock.go_to(1_050)
     stages.end("rest", {"robot": 7, "filter": 30})
     assert list(stages.took_ns.items()) == [("source", 10), ("robot", 7), ("filter", 30), ("rest", 3)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a unit turns to, with masters that listen on loopback and announcements that a test makes up."""
+"""Where a unit turns to: masters that listen on loopback, announcements and a clock that a test makes up."""
 
 from __future__ import annotations
 
@@ -15,21 +15,35 @@ import pytest
 from edge_unit.config import UnitConfig
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from edge_unit.uplink import master_discovery as module
-from edge_unit.uplink.master_discovery import FILE_NAME, LOST_S, VAIN_S, MasterSearch, load_kept, save_kept
+from edge_unit.uplink.master_discovery import (
+    FILE_NAME,
+    HEAR_FIRST_S,
+    HEAR_S,
+    LOOK_S,
+    LOST_S,
+    TELL_S,
+    VAIN_S,
+    MasterSearch,
+    load_kept,
+    save_kept,
+)
 from edge_unit.uplink.master_selection import Kept, Place
-from shared.clock import NS_PER_S, monotonic_ns
 from shared.discovery import Announcement, Offer
 from shared.messages import CONTRACT_VERSION
+from shared.waiting import within
+from tests.set_clock import START_NS, S, SetClock
 
-pytestmark = pytest.mark.alone
+LOST_NS = round(LOST_S * S)
 
-LOST_NS = round(LOST_S * NS_PER_S)
+PATIENCE_S = 20.0
+"""For a connection on loopback, on a busy machine; by the real clock, and so never measured."""
 
 
 class FakeBrowser:
     """Hears what a test says."""
 
     heard: tuple[Offer, ...] = ()
+    closed: asyncio.Event
 
     def __init__(self) -> None:
         self.changed = asyncio.Event()
@@ -38,18 +52,23 @@ class FakeBrowser:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        return
+        self.closed.set()
 
     async def offers(self) -> tuple[Offer, ...]:
         return self.heard
 
 
+@pytest.fixture
+def clock() -> SetClock:
+    return SetClock()
+
+
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def made_up(monkeypatch: pytest.MonkeyPatch, clock: SetClock) -> None:
+    monkeypatch.setattr(FakeBrowser, "closed", clock.added, raising=False)
     monkeypatch.setattr(module, "Browser", FakeBrowser)
-    monkeypatch.setattr(module, "HEAR_S", 0.0)
-    monkeypatch.setattr(module, "HEAR_FIRST_S", 0.0)
-    monkeypatch.setattr(module, "LOOK_S", 0.02)
+    # A busy machine may be slow to connect to itself; nobody here listens without answering.
+    monkeypatch.setattr(module, "REACH_S", PATIENCE_S)
     monkeypatch.setattr(FakeBrowser, "heard", ())
 
 
@@ -66,8 +85,8 @@ async def listening() -> AsyncIterator[int]:
 
 
 @asynccontextmanager
-async def running(config: UnitConfig) -> AsyncIterator[MasterSearch]:
-    search = await asyncio.to_thread(MasterSearch, config)
+async def running(config: UnitConfig, clock: SetClock) -> AsyncIterator[MasterSearch]:
+    search = await asyncio.to_thread(MasterSearch, config, clock)
     task = asyncio.create_task(search.run())
     try:
         yield search
@@ -80,24 +99,51 @@ def offer(port: int, cell: str = "demo") -> Offer:
     return Offer(f"{cell} at {port}", Announcement(cell, "00" * 8, CONTRACT_VERSION), ("127.0.0.1",), port)
 
 
-async def place_other_than(search: MasterSearch, url: str) -> Place:
-    deadline_ns = monotonic_ns() + 5 * NS_PER_S
-    while (place := await search.place()).url == url:
-        assert monotonic_ns() < deadline_ns
-        await asyncio.sleep(0.01)
-    return place
+async def pass_time(search: MasterSearch, clock: SetClock, seconds: float) -> None:
+    """Let so much time pass, look by look; the time at which a place is taken is the end of it."""
+    end_ns = clock.now + round(seconds * S)
+
+    async def rests() -> None:
+        while search.lost and clock.due_ns() is None:
+            clock.added.clear()
+            await clock.added.wait()
+
+    while True:
+        assert await within(PATIENCE_S, rests())
+        due_ns = clock.due_ns()
+        if due_ns is None or due_ns > end_ns:
+            break
+        clock.step()
+    if search.lost:
+        clock.go_to(end_ns)
+
+
+def lose(search: MasterSearch, clock: SetClock) -> None:
+    """Have the master not answer for so long that it is lost."""
+    search.unanswered(clock.now)
+    clock.go_to(clock.now + LOST_NS - 1)
+    search.unanswered(clock.now)
+    assert not search.lost
+    clock.go_to(clock.now + 1)
+    search.unanswered(clock.now)
+    assert search.lost
 
 
 async def test_an_announced_master_is_taken_by_a_unit_that_knows_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SetClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async with listening() as port, running(config(tmp_path)) as search:
+    async with listening() as port, running(config(tmp_path), clock) as search:
+        await pass_time(search, clock, 60.0)
         assert search.lost
+        heard_ns = clock.now
         monkeypatch.setattr(FakeBrowser, "heard", (offer(port),))
+        await pass_time(search, clock, 60.0)
+        assert not search.lost
+        # From the look at which nobody was heard yet; all who are there have answered since.
+        assert HEAR_FIRST_S <= (clock.now - heard_ns) / S <= HEAR_FIRST_S + LOOK_S
         place = await search.place()
         assert place == Place(f"http://127.0.0.1:{port}", f"announced as 'demo at {port}'")
         await search.keep(place.url, "demo")
-        assert not search.lost
     kept = await asyncio.to_thread(load_kept, tmp_path / FILE_NAME)
     assert kept == Kept(place.url, "demo", place.found_by)
     # After a restart it goes there at once.
@@ -106,65 +152,66 @@ async def test_an_announced_master_is_taken_by_a_unit_that_knows_none(
 
 
 async def test_the_same_cells_master_elsewhere_takes_the_place_of_one_that_is_silent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SetClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     old = "http://127.0.0.1:9"
-    async with listening() as port, running(config(tmp_path, master_url=old)) as search:
+    async with listening() as port, running(config(tmp_path, master_url=old), clock) as search:
         await search.keep(old, "demo")
         search.answered(old)
         monkeypatch.setattr(FakeBrowser, "heard", (offer(port, "other"), offer(port)))
-        now_ns = monotonic_ns()
-        search.unanswered(now_ns)
-        assert not search.lost
-        search.unanswered(now_ns + LOST_NS)
-        assert search.lost
-        assert (await place_other_than(search, old)).found_by == f"announced as 'demo at {port}'"
+        lose(search, clock)
+        await pass_time(search, clock, 60.0)
+        assert (await search.place()).found_by == f"announced as 'demo at {port}'"
+        assert clock.now == START_NS + LOST_NS + round(HEAR_S * S)
 
 
 async def test_what_was_tried_in_vain_is_not_tried_again_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SetClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    old = "http://127.0.0.1:9"
-    async with listening() as first, listening() as second, running(config(tmp_path)) as search:
+    async with listening() as first, listening() as second, running(config(tmp_path), clock) as search:
         monkeypatch.setattr(FakeBrowser, "heard", (offer(first),))
+        await pass_time(search, clock, 60.0)
         vain = await search.place()
         monkeypatch.setattr(FakeBrowser, "heard", (offer(first), offer(second)))
-        now_ns = monotonic_ns()
-        for later_ns in (0, LOST_NS):
-            search.unanswered(now_ns + later_ns)
-        taken = await place_other_than(search, vain.url)
-        assert taken.url == f"http://127.0.0.1:{second}" != old
+        lose(search, clock)
+        await pass_time(search, clock, 60.0)
+        taken, taken_ns = await search.place(), clock.now
+        assert taken.url == f"http://127.0.0.1:{second}"
         # The other one, which never answered, waits for its time, and so it stays.
-        for later_ns in (0, LOST_NS):
-            search.unanswered(now_ns + later_ns)
-        await asyncio.sleep(0.2)
-        assert (await search.place()).url == taken.url
+        lose(search, clock)
+        again_ns = taken_ns + round(VAIN_S * S)
+        await pass_time(search, clock, (again_ns - 1 - clock.now) / S)
+        assert await search.place() == taken
         assert search.lost
-        monkeypatch.setattr(module, "monotonic_ns", lambda: monotonic_ns() + round(VAIN_S * NS_PER_S))
-        assert await place_other_than(search, taken.url) == vain
+        await pass_time(search, clock, 60.0)
+        assert await search.place() == vain
+        assert again_ns <= clock.now <= again_ns + round(LOOK_S * S)
 
 
-async def test_a_change_of_configuration_is_not_undone_by_what_was_kept(tmp_path: Path) -> None:
+async def test_a_change_of_configuration_is_not_undone_by_what_was_kept(tmp_path: Path, clock: SetClock) -> None:
     async with listening() as port:
         kept = Kept(f"http://127.0.0.1:{port}", "demo", "configured", "http://127.0.0.1:7")
         await asyncio.to_thread(save_kept, tmp_path / FILE_NAME, kept)
-        async with running(config(tmp_path, master_url="http://127.0.0.1:9")) as search:
-            now_ns = monotonic_ns()
-            for later_ns in (0, LOST_NS):
-                search.unanswered(now_ns + later_ns)
-            await asyncio.sleep(0.2)
+        async with running(config(tmp_path, master_url="http://127.0.0.1:9"), clock) as search:
+            lose(search, clock)
+            await pass_time(search, clock, 60.0)
+            assert search.lost
             assert (await search.place()).url == "http://127.0.0.1:9"
 
 
 async def test_the_journal_is_not_filled_by_strangers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, clock: SetClock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    async with running(config(tmp_path, cell="demo")):
-        for number in range(20):
+    looks = 20
+    async with running(config(tmp_path, cell="demo"), clock) as search:
+        monkeypatch.setattr(FakeBrowser, "heard", (offer(1, "stranger"),))
+        await pass_time(search, clock, HEAR_S)
+        for number in range(looks):
             monkeypatch.setattr(FakeBrowser, "heard", (offer(1, f"cell{number}"),))
-            await asyncio.sleep(0.03)
-    assert len([record for record in caplog.records if record.name == module.__name__]) == 1
+            await pass_time(search, clock, LOOK_S)
+    lines = [record for record in caplog.records if record.name == module.__name__]
+    assert len(lines) == 1 + looks * LOOK_S // TELL_S
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,11 @@ import pytest
 
 from edge_unit.uplink import outbox as module
 from edge_unit.uplink.assignment import Assignment, Delivery, Report
-from edge_unit.uplink.outbox import Outbox
+from edge_unit.uplink.outbox import HEARTBEAT_S, Outbox
 from shared.cell import Cell
 from shared.messages import Versions
 from shared.settings import Settings
+from tests.set_clock import START_NS, S, SetClock
 
 CELL = Cell("cell", np.zeros(3), np.ones(3))
 ASSIGNMENT = Assignment(1, Versions(), Settings(), CELL.lattice(0.05), CELL, None)
@@ -21,7 +22,8 @@ DELIVERY = Delivery(1, 2, 3)
 class Sent:
     def __init__(self) -> None:
         self.reports: list[tuple[Report, Delivery | None]] = []
-        self.outbox = Outbox(lambda report, delivery: self.reports.append((report, delivery)))
+        self.clock = SetClock()
+        self.outbox = Outbox(lambda report, delivery: self.reports.append((report, delivery)), self.clock)
 
 
 def report() -> Report:
@@ -70,19 +72,31 @@ async def test_it_is_drained_when_nothing_is_left_and_not_while_one_replaces_ano
     await waiting
     assert warned == []
     sent.outbox.offer(report())
-    await sent.outbox.drained(0.01)
+    waiting = asyncio.ensure_future(sent.outbox.drained(5.0))
+    await sent.clock.waited_for()
+    assert sent.clock.step() == START_NS + 5 * S
+    await waiting
     assert warned == ["the last frame did not reach the master"]
     sent.outbox.drop()
     await sent.outbox.drained(5.0)
     assert len(warned) == 1
 
 
-async def test_it_wakes_for_a_report_and_for_the_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "HEARTBEAT_S", 0.01)
+async def test_it_wakes_for_a_report_and_for_the_heartbeat() -> None:
     sent = Sent()
-    await sent.outbox.woken()
+    waiting = asyncio.ensure_future(sent.outbox.woken())
+    await sent.clock.waited_for()
+    assert sent.clock.step() == START_NS + round(HEARTBEAT_S * S)
+    await waiting
     waiting = asyncio.ensure_future(sent.outbox.woken(heartbeat=False))
     await asyncio.sleep(0)
+    assert sent.clock.due_ns() is None
     assert not waiting.done()
     sent.outbox.offer(report())
     await waiting
+    # What is sent before its time takes the heartbeat's call back.
+    waiting = asyncio.ensure_future(sent.outbox.woken())
+    await sent.clock.waited_for()
+    sent.outbox.offer(report())
+    await waiting
+    assert sent.clock.due_ns() is None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exchange against a master that is nothing but its answers."""
+"""The exchange against a master that is nothing but its answers, by a clock that the tests set."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, cast
 
 import numpy as np
@@ -18,10 +19,10 @@ from edge_unit.uplink import uplink as module
 from edge_unit.uplink.assignment import Delivery, Report, Trouble, seen_report
 from edge_unit.uplink.cell_cache import CellCache
 from edge_unit.uplink.client import TIMEOUT, MasterClient
+from edge_unit.uplink.outbox import HEARTBEAT_S
 from edge_unit.uplink.uplink import Uplink
 from shared.camera import Intrinsics
 from shared.cell import Cell
-from shared.clock import monotonic_ns
 from shared.errors import MasterRefused, MasterUnreachable, WireError
 from shared.lattice import Lattice
 from shared.messages import (
@@ -42,8 +43,7 @@ from shared.messages import (
 from shared.settings import Settings
 from shared.transforms import from_xyz_rpy
 from shared.wire import unpack_seen
-
-pytestmark = pytest.mark.alone
+from tests.set_clock import MS, S, SetClock
 
 CAMERA = CameraInfo("A", "model", Intrinsics(8, 6, 10.0, 10.0, 4.0, 3.0))
 POSE = from_xyz_rpy((1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
@@ -51,30 +51,49 @@ CELL = Cell("cell", np.zeros(3), np.ones(3))
 LATTICE = CELL.lattice(0.05)
 CLOCK_AHEAD_NS = 5 * 10**12
 
+TURNS = 50
+"""Of the event loop: more than the uplink takes from one wait to the next, for nothing here waits for anything else."""
+
+CALLS = 100
+"""Of the clock: more than any test needs."""
+
 
 @dataclass
 class FakeMaster:
-    """Answers in turn with `answers`: an error, what an answer should contain, or nothing in particular."""
+    """Answers in turn with `answers`: an error, what an answer should contain, or nothing in particular.
 
+    Each question and each answer takes `trip_ns`; its clock is ahead of the unit's.
+    """
+
+    clock: SetClock
     versions: Versions = field(default_factory=lambda: Versions(settings=1, lattice=1, cell=1, pose=1))
     knows_pose: bool = True
     answers: list[Exception | dict[str, Any]] = field(default_factory=list)
     registrations: list[InitializeRequest] = field(default_factory=list)
+    refused_at_ns: list[int] = field(default_factory=list)
     updates: list[UpdateRequest] = field(default_factory=list)
     poses: list[tuple[int, str]] = field(default_factory=list)
     joints: tuple[JointSample, ...] = ()
     refuse: Exception | None = None
     gate: asyncio.Event | None = None
+    trip_ns: int = MS
     url: str = "http://fake"
+
+    def now_ns(self) -> int:
+        """The time by the master's clock, when a question has reached it."""
+        self.clock.now += self.trip_ns
+        return self.clock.now + CLOCK_AHEAD_NS
 
     async def authorize(self) -> None:
         """Anyone may."""
 
     async def initialize(self, request: InitializeRequest) -> InitializeAnswer:
         if self.refuse is not None:
+            self.refused_at_ns.append(self.clock.now)
             raise self.refuse
         self.registrations.append(request)
-        now_ns = monotonic_ns() + CLOCK_AHEAD_NS
+        now_ns = self.now_ns()
+        self.clock.now += self.trip_ns
         return InitializeAnswer(
             id=7,
             session=100 + len(self.registrations),
@@ -94,7 +113,8 @@ class FakeMaster:
         answer = self.answers.pop(0) if self.answers else {}
         if isinstance(answer, Exception):
             raise answer
-        now_ns = monotonic_ns() + CLOCK_AHEAD_NS
+        now_ns = self.now_ns()
+        self.clock.now += self.trip_ns
         fields = {"versions": self.versions, "received_at_ns": now_ns, "answered_at_ns": now_ns, **answer}
         return UpdateAnswer(**fields)
 
@@ -102,7 +122,7 @@ class FakeMaster:
         if self.refuse is not None:
             raise self.refuse
         samples = tuple(sample for sample in self.joints if sample.at_ns > since_ns)
-        return RobotAnswer(state="fresh", joint_names=("a",), now_ns=monotonic_ns(), joints=samples)
+        return RobotAnswer(state="fresh", joint_names=("a",), now_ns=self.now_ns(), joints=samples)
 
     async def put_pose(self, unit_id: int, T_world_camera: Any, origin: str) -> int:
         self.poses.append((unit_id, origin))
@@ -116,7 +136,8 @@ class OneCell:
 
 class Bench:
     def __init__(self, **fields: Any) -> None:
-        self.master = FakeMaster(**fields)
+        self.clock = SetClock()
+        self.master = FakeMaster(self.clock, **fields)
         self.sent: list[tuple[Report, Delivery | None]] = []
         self.uplink = Uplink(
             cast(MasterClient, self.master),
@@ -124,21 +145,26 @@ class Bench:
             "software",
             "boot",
             lambda report, delivery: self.sent.append((report, delivery)),
+            clock=self.clock,
         )
 
     def report(self, number: int = 0, seen: SeenBlocks | None = None) -> Report:
         assert self.uplink.assignment is not None
-        return Report(self.uplink.assignment, monotonic_ns(), bytes((number, 0, 0, 0)), seen)
+        return Report(self.uplink.assignment, self.clock.now, bytes((number, 0, 0, 0)), seen)
 
     def keys(self) -> list[int]:
         return [update.keys[0] if update.keys else -1 for update in self.master.updates]
 
-
-async def until(look: Callable[[], Any]) -> None:
-    deadline_ns = monotonic_ns() + 5 * 10**9
-    while not look():
-        assert monotonic_ns() < deadline_ns
-        await asyncio.sleep(0.001)
+    async def until(self, look: Callable[[], Any]) -> None:
+        """Let the uplink do all that it can, and then go on to the clock's next call, until `look` finds something."""
+        for _ in range(CALLS):
+            for _ in range(TURNS):
+                if look():
+                    return
+                await asyncio.sleep(0)
+            assert self.clock.due_ns() is not None, "the uplink waits for nothing that comes"
+            self.clock.step()
+        pytest.fail(f"not within {CALLS} calls of the clock")
 
 
 @contextlib.asynccontextmanager
@@ -149,7 +175,7 @@ async def running(**fields: Any) -> AsyncIterator[Bench]:
     bench.uplink.set_camera(CAMERA, None)
     try:
         if bench.master.refuse is None:
-            await asyncio.wait_for(bench.uplink.assigned.wait(), 5.0)
+            await bench.until(bench.uplink.assigned.is_set)
         yield bench
     finally:
         task.cancel()
@@ -160,19 +186,21 @@ async def running(**fields: Any) -> AsyncIterator[Bench]:
 async def test_it_registers_and_reports() -> None:
     async with running() as bench:
         report = bench.report(1)
+        before_ns = bench.clock.now
         bench.uplink.offer(report)
-        await bench.uplink.drained(5.0)
+        await bench.until(lambda: bench.sent)
         update = next(update for update in bench.master.updates if update.keys)
         assert (update.id, update.session) == (7, 101)
         assert update.captured_at_ns == report.captured_at_ns
         assert update.versions == bench.master.versions
         assert update.exchange is not None
-        assert update.exchange.offset_ns == pytest.approx(CLOCK_AHEAD_NS, abs=10**8)
+        assert update.exchange.offset_ns == CLOCK_AHEAD_NS
+        assert update.exchange.returned_ns - update.exchange.sent_ns == 2 * MS
         sent, delivery = bench.sent[0]
         assert sent is report
         assert delivery is not None
         # By the unit's clock, although the master's is far ahead.
-        assert all(abs(at_ns - monotonic_ns()) < 10**9 for at_ns in delivery)
+        assert delivery == Delivery(before_ns, before_ns + MS, before_ns + MS)
     assert bench.master.registrations[0].serial == "A"
 
 
@@ -180,11 +208,11 @@ async def test_the_latest_report_wins() -> None:
     gate = asyncio.Event()
     async with running(gate=gate) as bench:
         bench.uplink.offer(bench.report(1))
-        await until(lambda: bench.keys()[-1:] == [1])
+        await bench.until(lambda: bench.keys()[-1:] == [1])
         for number in (2, 3, 4):
             bench.uplink.offer(bench.report(number))
         gate.set()
-        await bench.uplink.drained(5.0)
+        await bench.until(lambda: len(bench.sent) == 4)
         assert bench.keys()[-2:] == [1, 4]
         assert [merged is not None for _, merged in bench.sent] == [False, False, True, True]
 
@@ -192,11 +220,13 @@ async def test_the_latest_report_wins() -> None:
 async def test_sequences_rise_and_the_last_report_is_repeated_while_nothing_new_comes() -> None:
     async with running() as bench:
         bench.uplink.offer(bench.report(1))
-        await until(lambda: bench.keys().count(1) >= 3)
+        await bench.until(lambda: bench.keys().count(1) >= 3)
         sequences = [update.sequence for update in bench.master.updates]
         assert sequences == sorted(set(sequences))
         repeated = [update for update in bench.master.updates if update.keys]
         assert len({update.captured_at_ns for update in repeated}) == 1
+        # Each a heartbeat after the answer to the one before.
+        assert {b.sent_at_ns - a.sent_at_ns for a, b in pairwise(repeated)} == {round(HEARTBEAT_S * S) + 2 * MS}
         assert len(bench.sent) == 1
 
 
@@ -205,13 +235,13 @@ async def test_a_master_that_does_not_know_it_any_more_is_asked_again(status: in
     async with running() as bench:
         bench.master.answers = [MasterRefused("gone", status)]
         bench.uplink.offer(bench.report(1))
-        await until(lambda: len(bench.master.registrations) == 2 and bench.uplink.assignment is not None)
+        await bench.until(lambda: len(bench.master.registrations) == 2 and bench.uplink.assignment is not None)
         before = len(bench.master.updates)
-        await until(lambda: len(bench.master.updates) > before)
+        await bench.until(lambda: len(bench.master.updates) > before)
         # What was made for the session before is not told to the new one.
         assert {(update.session, update.keys) for update in bench.master.updates[before:]} == {(102, b"")}
         bench.uplink.offer(bench.report(2))
-        await until(lambda: bench.keys()[-1] == 2)
+        await bench.until(lambda: bench.keys()[-1] == 2)
 
 
 @pytest.mark.parametrize("error", [MasterUnreachable("nobody"), MasterRefused("busy", 503), WireError("nonsense")])
@@ -219,18 +249,24 @@ async def test_other_trouble_is_waited_out_in_the_same_session(error: Exception)
     async with running() as bench:
         bench.master.answers = [error, error]
         bench.uplink.offer(bench.report(1))
-        await bench.uplink.drained(5.0)
+        await bench.until(lambda: bench.sent)
         assert bench.keys()[-3:] == [1, 1, 1]
         assert [merged is not None for _, merged in bench.sent] == [True]
         assert len(bench.master.registrations) == 1
 
 
-async def test_it_keeps_asking_a_master_that_is_not_there() -> None:
+async def test_it_keeps_asking_a_master_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module.random, "uniform", lambda low, high: (low + high) / 2.0)
     async with running(refuse=MasterUnreachable("nobody")) as bench:
-        await asyncio.sleep(0.2)
+        await bench.until(lambda: len(bench.master.refused_at_ns) == 6)
         assert bench.uplink.assignment is None
+        # Ever less often, but often enough for a master that returns.
+        waits_ms = [(after - before) / MS for before, after in pairwise(bench.master.refused_at_ns)]
+        assert waits_ms == [50.0, 100.0, 200.0, 250.0, 250.0]
         bench.master.refuse = None
-        await asyncio.wait_for(bench.uplink.assigned.wait(), 2.0 * module.RETRY_MAX_S)
+        last_ns = bench.clock.now
+        await bench.until(bench.uplink.assigned.is_set)
+        assert bench.clock.now - last_ns <= round(module.RETRY_MAX_S * S) + 2 * MS
 
 
 @pytest.mark.parametrize("knows_pose", [False, True])
@@ -239,7 +275,7 @@ async def test_a_known_pose_is_told_and_what_the_master_answers_counts(knows_pos
     told = from_xyz_rpy((0.0, 0.0, 0.5), (0.0, 0.0, 0.0))
     task = asyncio.create_task(bench.uplink.run())
     bench.uplink.set_camera(CAMERA, (told, "source"))
-    await asyncio.wait_for(bench.uplink.assigned.wait(), 5.0)
+    await bench.until(bench.uplink.assigned.is_set)
     task.cancel()
     assert bench.master.registrations[0].T_world_camera == matrix_of(told)
     assert bench.master.registrations[0].pose_origin == "source"
@@ -260,7 +296,7 @@ async def test_what_the_master_changes_is_a_new_assignment() -> None:
             "T_world_camera": matrix_of(moved),
         }
         bench.master.answers = [changes]
-        await until(lambda: bench.uplink.assignment is not first)
+        await bench.until(lambda: bench.uplink.assignment is not first)
         second = bench.uplink.assignment
         assert second is not None
         assert second.versions == bench.master.versions
@@ -271,7 +307,7 @@ async def test_what_the_master_changes_is_a_new_assignment() -> None:
         assert second.session == first.session
         # And a pose that is void.
         bench.master.versions = bench.master.versions.model_copy(update={"pose": 3})
-        await until(lambda: bench.uplink.assignment is not second)
+        await bench.until(lambda: bench.uplink.assignment is not second)
         assert bench.uplink.assignment is not None
         assert bench.uplink.assignment.T_world_camera is None
 
@@ -279,11 +315,11 @@ async def test_what_the_master_changes_is_a_new_assignment() -> None:
 async def test_another_camera_ends_the_session_even_while_an_answer_is_under_way() -> None:
     gate = asyncio.Event()
     async with running(gate=gate) as bench:
-        await until(lambda: bench.master.updates)
+        await bench.until(lambda: bench.master.updates)
         bench.uplink.set_camera(CameraInfo("B", "model", CAMERA.intrinsics), None)
         bench.master.versions = Versions(settings=2, lattice=1, cell=1, pose=1)
         gate.set()
-        await until(lambda: len(bench.master.registrations) == 2 and bench.uplink.assignment is not None)
+        await bench.until(lambda: len(bench.master.registrations) == 2 and bench.uplink.assignment is not None)
         assert bench.master.registrations[1].serial == "B"
         assert bench.uplink.assignment is not None
         assert bench.uplink.assignment.session == 102
@@ -293,20 +329,22 @@ async def test_commands_are_carried_out_once_and_told_until_the_master_knows() -
     async with running() as bench:
         command = Command(id=5, verb="learn_background")
         bench.master.answers = [{"commands": (command,)}] * 3
-        await until(lambda: not bench.master.answers)
+        await bench.until(lambda: not bench.master.answers)
         assert bench.uplink.commands.get_nowait() == command
         assert bench.uplink.commands.empty()
         bench.master.answers = [MasterUnreachable("nobody")]
         bench.uplink.finish(command, Outcome("failed", "no board in view"))
         before = len(bench.master.updates)
         ended = ((5, "no board in view", "failed"),)
-        await until(lambda: len([update for update in bench.master.updates[before:] if update.done == ended]) >= 2)
-        await until(lambda: bench.master.updates[-1].done == ())
+        await bench.until(
+            lambda: len([update for update in bench.master.updates[before:] if update.done == ended]) >= 2
+        )
+        await bench.until(lambda: bench.master.updates[-1].done == ())
 
 
 async def test_joints_that_are_missing_are_asked_for() -> None:
     async with running() as bench:
-        now_ns = monotonic_ns()
+        now_ns = bench.clock.now
         bench.master.joints = (JointSample(now_ns, (0.5,), None),)
         await bench.uplink.refresh_joints(now_ns)
         assert bench.uplink.joints.newest_ns == now_ns
@@ -322,21 +360,22 @@ async def test_what_is_seen_is_told_when_it_changes_and_until_it_is_known() -> N
     async with running() as bench:
         for number, (seen, told) in enumerate(((one, True), (one, False), (other, True), (other, False)), 1):
             bench.uplink.offer(bench.report(number, seen))
-            await until(lambda number=number: bench.keys()[-1:] == [number])
-            await bench.uplink.drained(5.0)
+            await bench.until(lambda number=number: len(bench.sent) == number)
             first = next(update for update in bench.master.updates if update.keys[:1] == bytes((number,)))
             assert (first.seen is not None) == told
         bench.master.answers = [MasterUnreachable("nobody")]
         bench.uplink.offer(bench.report(5, one))
-        await until(lambda: len([u for u in bench.master.updates if u.keys[:1] == b"\5" and u.seen]) == 2)
+        await bench.until(lambda: len([u for u in bench.master.updates if u.keys[:1] == b"\5" and u.seen]) == 2)
 
 
 async def test_trouble_goes_along_with_every_report() -> None:
     async with running() as bench:
         bench.uplink.camera_state.trouble = Trouble("camera", "camera: unplugged")
-        await until(lambda: bench.master.updates and bench.master.updates[-1].health.trouble == "camera: unplugged")
+        await bench.until(
+            lambda: bench.master.updates and bench.master.updates[-1].health.trouble == "camera: unplugged"
+        )
         bench.uplink.camera_state.trouble = None
-        await until(lambda: bench.master.updates[-1].health.trouble is None)
+        await bench.until(lambda: bench.master.updates[-1].health.trouble is None)
 
 
 def test_what_would_be_too_long_is_told_in_larger_blocks() -> None:

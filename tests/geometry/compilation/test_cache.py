@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes of their own, since where kernels are kept is settled when the package is imported."""
+"""The folder of compiled kernels, tested in separate processes, since importing the package chooses it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ print(numba.config.CACHE_DIR)
 
 
 def compile_with(tmp_path: Path, *arguments: str, **variables: str) -> tuple[str, str]:
-    """The folder that numba uses and what was logged, of a process that compiles a kernel."""
+    """Compile a kernel in a new process; return the folder that numba uses, and the log."""
     script = tmp_path / "compile.py"
     script.write_text(COMPILE)
     environment = {name: text for name, text in os.environ.items() if name not in jit_cache.VARIABLES}
@@ -47,7 +47,7 @@ def compile_with(tmp_path: Path, *arguments: str, **variables: str) -> tuple[str
     return done.stdout.strip(), done.stderr.strip()
 
 
-def test_by_default_it_is_where_numba_would_keep_them(tmp_path: Path) -> None:
+def test_the_default_is_the_folder_of_numba(tmp_path: Path) -> None:
     found, logged = compile_with(tmp_path)
     assert Path(found).parent in jit_cache._numba_choices()
     assert logged == ""
@@ -69,7 +69,7 @@ def test_a_folder_from_the_configuration_wins(tmp_path: Path) -> None:
     assert logged == ""
 
 
-def test_a_folder_that_cannot_be_written_is_a_warning_and_no_crash(tmp_path: Path) -> None:
+def test_an_unwritable_folder_is_a_warning(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     wanted = str(tmp_path / "file" / "kernels")
     for arguments, variables in (((wanted,), {}), ((), {"NUMBA_CACHE_DIR": wanted})):
@@ -81,7 +81,7 @@ def test_a_folder_that_cannot_be_written_is_a_warning_and_no_crash(tmp_path: Pat
         assert Path(found).parent.stat().st_mode & 0o777 == 0o700
 
 
-def test_without_any_folder_of_its_own_a_private_one_is_taken(
+def test_without_a_writable_folder_a_private_one_is_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     for variable in jit_cache.VARIABLES:
@@ -108,7 +108,7 @@ def test_a_temporary_folder_that_others_may_have_filled_is_not_used(
     assert not jit_cache._private_folder().is_symlink()
 
 
-def test_when_nothing_at_all_can_be_written_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_names_the_lack_of_any_writable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setattr(jit_cache.tempfile, "tempdir", str(tmp_path / "file"))
     with pytest.raises(JitCacheError, match="not even a temporary one"):
@@ -116,7 +116,7 @@ def test_when_nothing_at_all_can_be_written_it_says_so(tmp_path: Path, monkeypat
 
 
 def test_each_state_of_the_kernels_has_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """numba would not see that a kernel or a constant in another file has changed."""
+    """numba does not detect a change of a kernel or a constant in another file."""
     monkeypatch.setattr(jit_cache.os, "environ", dict(os.environ))
     monkeypatch.setattr(numba.config, "CACHE_DIR", numba.config.CACHE_DIR)
     folders = []
@@ -130,7 +130,7 @@ def test_each_state_of_the_kernels_has_a_folder_of_its_own(tmp_path: Path, monke
     assert sorted((tmp_path / "cache").iterdir()) == sorted(folders[-jit_cache.STATES_MAX :])
 
 
-def test_links_that_a_power_cut_left_half_made_cost_no_state_that_is_kept(
+def test_incomplete_links_of_a_power_cut_do_not_displace_kept_states(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(jit_cache.os, "environ", dict(os.environ))
@@ -158,7 +158,7 @@ DAMAGE = {
 
 @pytest.mark.parametrize("damage", DAMAGE)
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
-def test_a_kernel_that_a_power_cut_damaged_is_compiled_anew(tmp_path: Path, kind: str, damage: str) -> None:
+def test_a_damaged_kernel_is_compiled_again(tmp_path: Path, kind: str, damage: str) -> None:
     folder, logged = compile_with(tmp_path, str(tmp_path / "cache"))
     assert logged == ""
     (file,) = Path(folder).glob(f"*/*.{kind}")
@@ -166,6 +166,6 @@ def test_a_kernel_that_a_power_cut_damaged_is_compiled_anew(tmp_path: Path, kind
     file.write_bytes(DAMAGE[damage](whole))
     found, logged = compile_with(tmp_path, str(tmp_path / "cache"))
     assert found == folder
-    assert logged == f"{file}: damaged, its kernel is compiled anew"
+    assert logged == f"{file}: damaged; its kernel will be compiled again"
     assert len(file.read_bytes()) > len(whole) // 2
     assert compile_with(tmp_path, str(tmp_path / "cache")) == (folder, "")

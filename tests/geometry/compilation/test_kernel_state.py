@@ -19,13 +19,13 @@ KERNEL_FILES = sorted(file.relative_to(PLACE) for folder in FOLDERS for file in 
 
 @pytest.fixture
 def place(tmp_path: Path) -> Path:
-    """A copy of all that has kernels, and of what tells their state."""
+    """Copy all files with kernels, and the module that computes their digest."""
     for folder in (*FOLDERS, "geometry/compilation"):
         shutil.copytree(PLACE / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))
     return tmp_path
 
 
-def test_a_change_of_any_kernel_file_is_another_state(place: Path) -> None:
+def test_a_change_of_any_kernel_file_changes_the_digest(place: Path) -> None:
     assert len(KERNEL_FILES) > 20
     states = {state_of_kernels(place)}
     for file in KERNEL_FILES:
@@ -34,30 +34,30 @@ def test_a_change_of_any_kernel_file_is_another_state(place: Path) -> None:
     assert len(states) == 1 + len(KERNEL_FILES)
 
 
-def test_a_kernel_of_another_name_is_another_state(place: Path) -> None:
+def test_a_renamed_kernel_changes_the_digest(place: Path) -> None:
     before = state_of_kernels(place)
     (place / KERNEL_FILES[0]).rename((place / KERNEL_FILES[0]).with_name("renamed.py"))
     assert state_of_kernels(place) != before
 
 
-def test_a_copy_has_the_state_of_its_source_wherever_it_lies(place: Path) -> None:
+def test_a_copy_has_the_digest_of_its_source_at_any_path(place: Path) -> None:
     assert state_of_kernels(place) == state_of_kernels()
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
-def test_kernels_that_moved_away_are_an_error(place: Path, folder: str) -> None:
+def test_a_folder_without_kernels_is_an_error(place: Path, folder: str) -> None:
     (place / folder).rename(place / "elsewhere")
     with pytest.raises(FileNotFoundError, match=f"{folder}: expected the kernels' source"):
         state_of_kernels(place)
 
 
-def test_without_kernels_no_folder_is_settled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_kernels_no_folder_is_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cache, "state_of_kernels", lambda: state_of_kernels(tmp_path))
     with pytest.raises(JitCacheError, match="expected the kernels' source"):
         cache.settle(tmp_path / "cache")
 
 
-def test_the_release_itself_tells_its_state_with_nothing_installed(place: Path) -> None:
+def test_a_release_prints_its_digest_with_nothing_installed(place: Path) -> None:
     script = [sys.executable, "-I", "-S", "-B", str(place / "geometry/compilation/kernel_state.py")]
     done = subprocess.run(script, capture_output=True, text=True, timeout=30.0, check=True)
     assert done.stdout.strip() == state_of_kernels()
@@ -80,5 +80,5 @@ def test_every_file_with_kernels_counts() -> None:
     assert Path("geometry/kernels/voxelize.py") in having
 
 
-def test_the_digits_are_as_many_as_it_says() -> None:
+def test_the_digest_has_the_stated_length() -> None:
     assert re.fullmatch(rf"[0-9a-f]{{{kernel_state.DIGITS}}}", state_of_kernels())

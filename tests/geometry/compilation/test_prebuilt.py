@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that were compiled on another computer: found where the processor fits, compiled anew where it does not."""
+"""Kernels compiled on another computer: used if the processor fits, compiled again if not."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ print(sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))
 
 
 def compile_one(tmp_path: Path, *arguments: str, **variables: str) -> str:
-    """How often a kernel was found, and how often it was compiled, by a process of its own."""
+    """Compile a kernel in a new process; return the numbers of cache hits and of compilations."""
     script = tmp_path / "compile.py"
     script.write_text(COMPILE)
     left_out = (*jit_cache.VARIABLES, VARIABLE, "NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES")
@@ -62,12 +62,12 @@ def compile_one(tmp_path: Path, *arguments: str, **variables: str) -> str:
 
 
 @needs_target
-def test_what_one_computer_compiled_the_others_do_not(tmp_path: Path) -> None:
+def test_kernels_of_one_computer_are_used_on_others(tmp_path: Path) -> None:
     folder = tmp_path / "carried"
     assert compile_one(tmp_path, "carry", str(folder), platform.machine()) == "0 1"
     assert compile_one(tmp_path, "use", **{VARIABLE: str(folder)}) == "1 0"
     assert not [path for path in (tmp_path / "own").rglob("*.nb?") if not path.is_symlink()]
-    # One that is lost is compiled in the link's place.
+    # A lost kernel is compiled in place of its link.
     own = next((tmp_path / "own").rglob("*.nbi"))
     own.unlink()
     own.symlink_to(tmp_path / "gone")
@@ -78,7 +78,7 @@ def test_what_one_computer_compiled_the_others_do_not(tmp_path: Path) -> None:
 
 
 @needs_target
-def test_a_lesser_processor_compiles_its_own(tmp_path: Path) -> None:
+def test_a_processor_without_the_features_compiles_its_own_kernels(tmp_path: Path) -> None:
     folder = tmp_path / "carried"
     compile_one(tmp_path, "carry", str(folder), platform.machine())
     cpuinfo = tmp_path / "cpuinfo"
@@ -86,7 +86,7 @@ def test_a_lesser_processor_compiles_its_own(tmp_path: Path) -> None:
     assert compile_one(tmp_path, "lesser", str(cpuinfo), **{VARIABLE: str(folder)}).split()[1] == "1"
 
 
-def test_every_core_must_be_able_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_core_must_have_the_features(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cpuinfo = tmp_path / "cpuinfo"
     monkeypatch.setattr(prebuilt, "CPUINFO", cpuinfo)
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
@@ -103,7 +103,7 @@ def test_every_core_must_be_able_to(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert not X86_64_V3.runs_here()
 
 
-def test_only_what_is_there_and_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_existing_kernels_of_this_state_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = Target("any", platform.machine(), "any-cpu", frozenset())
     monkeypatch.setattr(prebuilt, "TARGETS", (target,))
     monkeypatch.setattr(prebuilt, "_flags", lambda _machine: frozenset())
@@ -115,7 +115,7 @@ def test_only_what_is_there_and_wanted(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setenv(VARIABLE, str(tmp_path))
     assert carried("other") is None
     assert carried("state") == (target, kernels)
-    # Told to compile for another processor, it does.
+    # A process configured for another processor compiles for it.
     monkeypatch.setenv("NUMBA_CPU_NAME", "host")
     assert carried("state") is None
 

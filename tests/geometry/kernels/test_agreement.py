@@ -35,7 +35,7 @@ def twin(
 
 @pytest.mark.parametrize("stride_px", [1, 3, 8])
 @pytest.mark.parametrize("shape", [(43, 61), (1, 1), (5, 200)])
-def test_tallies_are_those_of_the_twin(stride_px: int, shape: tuple[int, int]) -> None:
+def test_tallies_equal_the_twin(stride_px: int, shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(stride_px)
     static = rng.integers(500, 3000, shape).astype(np.uint16)
     depth = (static + rng.normal(0.0, 60.0, shape)).astype(np.uint16)
@@ -46,7 +46,7 @@ def test_tallies_are_those_of_the_twin(stride_px: int, shape: tuple[int, int]) -
         assert (found == wanted).all()
 
 
-def test_nothing_measured_nothing_known_nothing_but_robot() -> None:
+def test_without_measurements_or_known_surfaces_or_beside_the_robot() -> None:
     shape = (16, 16)
     none, some, far = (np.full(shape, value, np.uint16) for value in (0, 1000, 65535))
     assert run(none, some, far, 1)[1].tolist() == [256, 0, 0, 0]

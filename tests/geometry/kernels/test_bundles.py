@@ -27,7 +27,7 @@ FROM_PYTHON_ONLY = {
     "uncertainty": forward.displace_links,
     "views": seen.block_views,
 }
-"""Kernels that no other calls."""
+"""Kernels that no other kernel calls."""
 
 
 class Pair(NamedTuple):
@@ -42,19 +42,19 @@ def test_a_plain_bundle_has_the_values_and_no_names() -> None:
 
 
 @pytest.fixture(scope="module")
-def a_frame_and_all_that_is_asked_of_it() -> None:
+def call_all_kernels() -> None:
     pipeline = DepthPipeline(camera(), ABOVE_TABLE, demo_cell())
     depth = np.full(pipeline.intrinsics.shape, 700, np.uint16)
     pipeline.process(depth, HOME_RAD, joint_uncertainty_rad=0.01, with_misfit=True)
     pipeline.learn([(depth, HOME_RAD)])
 
 
-# Where no kernel is kept yet, one test compiles them all.
+# With an empty cache, one test compiles all kernels.
 @pytest.mark.timeout(300)
-@pytest.mark.usefixtures("a_frame_and_all_that_is_asked_of_it")
+@pytest.mark.usefixtures("call_all_kernels")
 @pytest.mark.parametrize("name", sorted(FROM_PYTHON_ONLY))
-def test_nobody_hands_a_kernel_a_named_tuple(name: str) -> None:
-    """It would be compiled once more, and each call would take a microsecond a bundle longer."""
+def test_no_caller_passes_a_named_tuple(name: str) -> None:
+    """A named tuple would be compiled separately, and each call would take a microsecond a bundle longer."""
     signatures = cast(Any, FROM_PYTHON_ONLY[name]).signatures
     assert signatures
     assert any(isinstance(each, types.BaseTuple) for signature in signatures for each in signature)

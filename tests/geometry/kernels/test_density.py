@@ -56,7 +56,7 @@ def kept(
 ) -> set[int]:
     rimmed = np.pad(counts, 1)
     slots = np.flatnonzero(rimmed).astype(np.uint32)
-    # One more for what lies outside the lattice; its points count for nothing.
+    # One more slot for points outside the lattice, which do not count.
     memory = np.append(rimmed.ravel(), np.uint32(10**6)).astype(np.uint32)
     keys, kept_counts = (np.full(len(slots) + 1, 0xFFFFFFFF, np.uint32) for _ in range(2))
     number = keep_dense(
@@ -83,7 +83,7 @@ def twin(
     area_max_m2: float,
     points_min: float,
 ) -> set[int]:
-    """All voxels at once, with scipy's convolution for the neighbourhood."""
+    """Judge all voxels at once, with scipy's convolution for the neighbourhood."""
     size_m = lattice.voxel_size_m
     centre_m = apply(inverse(T_world_camera), lattice.centres(np.moveaxis(np.indices(lattice.shape), 0, -1)))
     if angular:
@@ -106,12 +106,14 @@ def twin(
 @pytest.mark.parametrize("single", [False, True])
 @pytest.mark.parametrize("size_m", [0.01, 0.05, 0.1])
 @pytest.mark.parametrize("shape", [(12, 9, 7), (1, 1, 1), (40, 1, 2), (3, 170, 4)])
-def test_keeps_what_the_twin_keeps(angular: bool, single: bool, size_m: float, shape: tuple[int, int, int]) -> None:
+def test_keeps_the_same_voxels_as_the_twin(
+    angular: bool, single: bool, size_m: float, shape: tuple[int, int, int]
+) -> None:
     rng = np.random.default_rng(sum(shape) + int(1000 * size_m))
     lattice = Lattice((-0.3, 0.1, -0.2), size_m, shape)
     sizes = []
     for _ in range(6):
-        # Some voxels lie behind the camera: then any count is enough of nothing.
+        # For voxels behind the camera the full count is 0, so any count is enough.
         pose = from_xyz_rpy(rng.normal(0.0, 0.6, 3), rng.uniform(-np.pi, np.pi, 3))
         z_m = apply(inverse(pose), lattice.centres(np.moveaxis(np.indices(shape), 0, -1)))[..., 2]
         full = FX * FY * (size_m / np.maximum(np.abs(z_m), 0.1)) ** 2
@@ -129,7 +131,7 @@ def test_nothing_touched() -> None:
 
 
 def test_the_neighbourhood_ends_at_the_lattice() -> None:
-    """A row's end is not the next row's beginning."""
+    """The end of a row is not a neighbour of the next row's first voxel."""
     shape = (3, 4, 5)
     counts = np.random.default_rng(0).integers(0, 9, shape).astype(np.uint32)
     around = ndimage.convolve(counts.astype(int), np.ones((3, 3, 3), int), mode="constant")
@@ -142,7 +144,7 @@ def test_the_neighbourhood_ends_at_the_lattice() -> None:
 
 @pytest.mark.parametrize("shape", [(512, 512, 512), (32767, 1, 4096), (1, 32767, 4096), (4096, 1, 32767), (1, 1, 1)])
 def test_slots_of_the_largest_lattices_are_located_exactly(shape: tuple[int, int, int]) -> None:
-    """By floating point, for integers are not divided by vectors; the first and last of each row count most."""
+    """In floating point, since vectors of integers cannot be divided; critical are the first and last slot of a row."""
     rng = np.random.default_rng(0)
     index = rng.integers(0, shape, (3000, 3))
     index[:1000] = np.where(rng.random((1000, 3)) < 0.5, 0, np.array(shape) - 1)
@@ -168,14 +170,14 @@ def test_a_hand_on_a_border_survives_here_and_not_in_the_paper() -> None:
     assert kept(counts, lattice, pose, single=True, threshold=0.5) == set()
 
 
-def test_own_share_keeps_a_few_stray_points_beside_a_surface_out() -> None:
+def test_own_share_removes_stray_points_beside_a_surface() -> None:
     lattice = Lattice((-0.25, -0.25, 1.4), 0.05, (10, 10, 4))
     counts = np.zeros(lattice.shape, np.uint32)
     counts[5, 5, 2], counts[5, 6, 2] = 120, 3
     assert len(kept(counts, lattice, from_xyz_rpy((0, 0, 0), (0, 0, 0)))) == 1
 
 
-def test_large_voxels_never_ask_for_more_than_a_hand() -> None:
+def test_large_voxels_never_require_more_than_a_hand() -> None:
     lattice = Lattice((-0.5, -0.5, 1.0), 0.1, (10, 10, 10))
     counts = np.zeros(lattice.shape, np.uint32)
     full = FX * FY * (0.1 / 1.55) ** 2
@@ -185,7 +187,7 @@ def test_large_voxels_never_ask_for_more_than_a_hand() -> None:
     assert len(kept(counts, lattice, pose, threshold=0.95, area_max_m2=0.01)) == 0
 
 
-def test_few_points_decide_nothing_however_far_away() -> None:
+def test_few_points_are_noise_at_any_distance() -> None:
     """At 5 m a voxel of 5 cm is full with ten points, and one wrong match has more."""
     lattice = Lattice((-0.5, -0.5, 4.5), 0.05, (20, 20, 20))
     pose = from_xyz_rpy((0, 0, 0), (0, 0, 0))
@@ -198,7 +200,7 @@ def test_few_points_decide_nothing_however_far_away() -> None:
     assert len(kept(counts, lattice, pose, points_min=40)) == 16
 
 
-def test_the_floor_of_points_leaves_small_voxels_alone() -> None:
+def test_the_least_number_of_points_does_not_affect_small_voxels() -> None:
     """At 3 m a voxel of 1 cm is full with one point: no neighbourhood ever holds forty."""
     lattice = Lattice((-0.1, -0.1, 2.9), 0.01, (20, 20, 20))
     counts = np.zeros(lattice.shape, np.uint32)

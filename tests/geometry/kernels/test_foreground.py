@@ -27,7 +27,7 @@ Image = NDArray[np.uint16]
 def twin(
     depth: Image, limit: Image, near: Image, span: Image, robot_columns: NDArray[np.int32], minimum: int
 ) -> NDArray[np.bool_]:
-    """The filter's words in wide integers: measured, in range, nearer than what stands still, and not robot."""
+    """Compute the filter in wide integers: measured, in range, nearer than static surfaces, and not robot."""
     d, static, low = depth.astype(np.int64), limit.astype(np.int64), near.astype(np.int64)
     high = low + span
     v, u = np.mgrid[0 : d.shape[0], 0 : d.shape[1]]
@@ -55,7 +55,7 @@ def no_robot(shape: tuple[int, int]) -> tuple[Image, Image]:
 
 @pytest.mark.parametrize("minimum", [1, 150, 40000, RAW_MAX])
 @pytest.mark.parametrize("width", [1, 7, 8, 61, 424])
-def test_marks_what_the_twin_marks(width: int, minimum: int) -> None:
+def test_marks_the_same_pixels_as_the_twin(width: int, minimum: int) -> None:
     rng = np.random.default_rng(width)
     shape = (23, width)
     depth, limit, near = (rng.integers(0, RAW_MAX, shape, np.uint16, endpoint=True) for _ in range(3))
@@ -90,7 +90,7 @@ def test_a_limit_of_0_hides_everything() -> None:
     assert not run(depth, np.zeros(shape, np.uint16), *no_robot(shape), no_robot_in(shape)).any()
 
 
-def test_without_a_robot_its_images_are_not_looked_at() -> None:
+def test_without_a_robot_its_images_are_not_read() -> None:
     shape = (5, 11)
     depth, far = np.full(shape, 1000, np.uint16), np.full(shape, RAW_MAX, np.uint16)
     band = np.zeros(shape, np.uint16), far

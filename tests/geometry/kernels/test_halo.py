@@ -27,7 +27,7 @@ def bands(w: NDArray[np.float32], padding_m: float) -> tuple[NDArray[np.int32], 
 
 
 def twin(w: NDArray[np.float32], padding_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Depth of the nearest and of the farthest edge that reaches over each pixel, NaN where none does."""
+    """Return the depths of the nearest and the farthest edge that reaches each pixel, NaN for none."""
     height, width = w.shape
     with np.errstate(divide="ignore"):
         z = np.where(w > 0, 1.0 / w.astype(np.float64), np.inf)
@@ -49,7 +49,7 @@ def twin(w: NDArray[np.float32], padding_m: float) -> tuple[NDArray[np.float64],
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("padding_m", [0.0, 0.0513, 0.21])
-def test_finds_what_the_twin_finds(seed: int, padding_m: float) -> None:
+def test_finds_the_same_bands_as_the_twin(seed: int, padding_m: float) -> None:
     rng = np.random.default_rng(seed)
     z = np.full(SHAPE, np.inf)
     for _ in range(6):
@@ -92,7 +92,7 @@ def test_a_plane_at_a_slant_has_no_edge() -> None:
     assert len(bands(w, 0.1)[0]) == 0
 
 
-def test_an_edge_that_fills_the_picture_and_one_beyond_raw_depth() -> None:
+def test_an_edge_that_fills_the_image_and_one_beyond_raw_depth() -> None:
     pixels, near_raw, span_raw = bands(edge(0.051, 1.0), 5.0)
     assert len(pixels) == SHAPE[0] * (SHAPE[1] - 20)
     assert (near_raw == 20).all()
@@ -100,7 +100,7 @@ def test_an_edge_that_fills_the_picture_and_one_beyond_raw_depth() -> None:
     assert (near_raw.astype(int) + span_raw == RAW_MAX).all()
 
 
-def test_only_what_lies_in_the_band_is_dropped() -> None:
+def test_only_pixels_in_the_band_are_dropped() -> None:
     depth = np.array([[0, 900, 950, 1000, 1050, 1051, RAW_MAX, 1000]], np.uint16)
     mask = np.ones((1, 16), np.uint8)
     mask[0, 7] = 0

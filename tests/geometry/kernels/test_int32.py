@@ -23,7 +23,7 @@ def each(
         signs[i] = none_negative(a[i], b[i], c[i])
 
 
-def test_they_are_those_of_numpy_also_where_they_overflow() -> None:
+def test_results_equal_numpy_also_on_overflow() -> None:
     rng = np.random.default_rng(0)
     limits = np.iinfo(np.int32)
     edges = np.array((limits.min, -1, 0, 1, limits.max), np.int32)

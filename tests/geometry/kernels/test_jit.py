@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""In processes of their own: a service without a folder that it can write still works, and a warm one starts fast."""
+"""Separate processes: a service without a writable folder works, and one with cached kernels starts fast."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ print(len(voxels), time.clock_gettime(time.CLOCK_MONOTONIC) - started_s)
 
 
 def first_frame(**variables: str) -> tuple[int, float, str]:
-    """Voxels, seconds from the start to the first frame, and what was logged."""
+    """Return the voxels, the seconds from the start to the first frame, and the log."""
     done = subprocess.run(
         [sys.executable, "-c", FIRST_FRAME],
         cwd=CHECKOUT,
@@ -49,8 +49,8 @@ def first_frame(**variables: str) -> tuple[int, float, str]:
 
 
 @pytest.mark.slow
-def test_without_a_folder_that_can_be_written_it_says_so_and_works(tmp_path: Path) -> None:
-    """The tests may run as root, who can write anywhere but below a file."""
+def test_without_a_writable_folder_it_works_with_a_warning(tmp_path: Path) -> None:
+    """The tests may run as root, which can write everywhere except below a file."""
     (tmp_path / "file").write_text("")
     below = str(tmp_path / "file" / "below")
     variables = {"HOME": below, "XDG_CACHE_HOME": below, "NUMBA_CACHE_DIR": below, "TMPDIR": str(tmp_path)}
@@ -64,7 +64,7 @@ def test_without_a_folder_that_can_be_written_it_says_so_and_works(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_the_first_frame_comes_soon_when_kernels_are_there(tmp_path: Path) -> None:
+def test_the_first_frame_is_fast_with_cached_kernels(tmp_path: Path) -> None:
     kept = str(tmp_path / "kernels")
     number, cold_s, _ = first_frame(CELLWATCH_JIT_CACHE=kept)
     again, warm_s, logged = first_frame(CELLWATCH_JIT_CACHE=kept)

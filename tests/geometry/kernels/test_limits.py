@@ -27,7 +27,7 @@ def static_twin(
     range_max_m: float,
     scale_m: float,
 ) -> NDArray[np.float64]:
-    """The limit in raw units, not yet rounded down."""
+    """Return the limit in raw units, before rounding down."""
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.where(w > 0, 1.0 / w.astype(np.float64), np.inf)
         cad_m = np.where(w > 0, 1.0 / (1.0 / z + noise_per_m) - base_m, np.inf)
@@ -54,7 +54,7 @@ def images(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.fl
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("scale_m", [0.001, 0.0001, 0.01])
-def test_static_limit_is_that_of_the_twin(seed: int, scale_m: float) -> None:
+def test_static_limit_equals_the_twin(seed: int, scale_m: float) -> None:
     figures = (0.04, 0.011, 0.05, 5.0, 6.0, scale_m)
     arrays = images(np.random.default_rng(seed))
     limit = static_limit(*arrays, *figures).astype(np.float64)
@@ -74,7 +74,7 @@ def test_static_limit_is_the_surface_less_its_margin() -> None:
     assert int(learned[0, 0]) == pytest.approx(1500 - 50 - 50, abs=3)
 
 
-def test_static_limit_where_nothing_is_known_is_the_range() -> None:
+def test_static_limit_without_a_known_surface_is_the_range() -> None:
     w, unlearned = np.zeros((1, 3), np.float32), np.full((1, 3), np.nan, np.float32)
     assert (static_limit(w, unlearned, unlearned, 0.04, 0.01, 0.05, 5.0, 2.5, 0.001) == 2500).all()
     assert (static_limit(w, unlearned, unlearned, 0.04, 0.01, 0.05, 5.0, 60.0, 0.0001) == RAW_MAX).all()
@@ -87,7 +87,7 @@ def test_static_limit_of_a_surface_within_its_margin_is_0() -> None:
 
 @pytest.mark.parametrize("noise_per_m", [0.001, 0.01, 0.05])
 def test_a_surface_farther_away_never_has_a_nearer_limit(noise_per_m: float) -> None:
-    """Noise grows with depth squared; a wall at 40 m must not hide who stands at 2 m."""
+    """Noise grows with depth squared; a wall at 40 m must not hide a person at 2 m."""
     z = np.linspace(0.1, 60.0, 2000, dtype=np.float32)[None]
     unlearned, w = np.full_like(z, np.nan), 1.0 / z
     cad = static_limit(w, unlearned, unlearned, 0.04, 2.0 * noise_per_m, 0.05, 5.0, 60.0, 0.001)
@@ -114,7 +114,7 @@ def band_twin(
     depth_m: float,
     scale_m: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper end in raw units; both RAW_MAX where no robot is."""
+    """Return the lower and upper end in raw units; both RAW_MAX without a robot."""
     front, back = nearest_w > NOTHING_NEAREST, farthest_w > NOTHING_FARTHEST
     drawn = front | back
     near_m = np.where(front, 1.0 / np.where(front, nearest_w, 1.0).astype(np.float64), 0.0)
@@ -125,11 +125,11 @@ def band_twin(
 
 
 RECTANGLES = np.array([[2, 20, 5, 40], [10, 30, 30, 60], [36, 36, 0, 60], [37, -1, 61, -1]], np.int32)
-"""Two that overlap, one at the picture's edge, an empty one."""
+"""Two that overlap, one at the edge of the image, an empty one."""
 
 
 def between(rectangles: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """In each row all between the leftmost and the rightmost rectangle."""
+    """Return, for each row, the pixels between the leftmost and the rightmost rectangle."""
     inside = np.zeros(SHAPE, np.bool_)
     for top, bottom, left, right in rectangles:
         inside[top : bottom + 1, left : right + 1] = True
@@ -139,7 +139,7 @@ def between(rectangles: NDArray[np.int32]) -> NDArray[np.bool_]:
 def windowed(
     image: NDArray[np.float32], rectangles: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """A window of an image (H, W), as the rasterizer leaves it, and its memory."""
+    """Return a window of an image (H, W) in the rasterizer's format, and its memory."""
     rows, columns = np.nonzero(between(rectangles))
     if not len(rows):
         return np.zeros(4, np.int64), np.full(image.size, np.nan, np.float32)
@@ -158,11 +158,11 @@ class Band:
         self.bundle = plain(limits.Band(self.near_raw, self.span_raw, self.columns))
 
     def draw(self, rng: np.random.Generator, rectangles: NDArray[np.int32], scale_m: float) -> None:
-        """Draw what is random, and compare all images with the twin's."""
+        """Draw random values, and compare all images with the twin's."""
         near_m = rng.uniform(0.05, 8.0, SHAPE)
         inside = between(rectangles)
         drawn = (rng.random(SHAPE) < 0.6) & inside
-        # Silhouettes and what the near plane cuts have only one of the two.
+        # Silhouettes and parts cut by the near plane have only one of the two.
         front, back = drawn & (rng.random(SHAPE) < 0.8), drawn & (rng.random(SHAPE) < 0.8)
         drawn = front | back
         nearest_w = np.where(front, 1.0 / near_m, NOTHING_NEAREST).astype(np.float32)
@@ -187,8 +187,8 @@ class Band:
 
 @pytest.mark.parametrize("scale_m", [0.001, 0.0001, 0.01])
 @pytest.mark.parametrize("seed", range(4))
-def test_robot_band_is_that_of_the_twin(seed: int, scale_m: float) -> None:
-    """Again and again on the same images: of the robot that was there before nothing is left."""
+def test_robot_band_equals_the_twin(seed: int, scale_m: float) -> None:
+    """Repeated on the same images: nothing is left of the previous robot."""
     rng = np.random.default_rng(seed)
     band = Band()
     for _ in range(6):
@@ -199,7 +199,7 @@ def test_robot_band_is_that_of_the_twin(seed: int, scale_m: float) -> None:
     assert (band.near_raw == RAW_MAX).all()
 
 
-def test_a_band_is_cleared_wherever_it_is() -> None:
+def test_a_band_is_cleared_anywhere() -> None:
     band = Band()
     band.draw(np.random.default_rng(0), RECTANGLES, 0.001)
     assert (band.near_raw < RAW_MAX).any()
@@ -223,7 +223,7 @@ def test_lower_depth_takes_the_nearer() -> None:
 
 
 def test_robot_band_of_a_surface_at_the_camera_starts_at_0() -> None:
-    """What lies nearer than a band that begins at 0 would wrap around; nothing does."""
+    """No depth is below a band that starts at 0, so no comparison wraps around."""
     w, one = np.full(1, 1 / 0.05, np.float32), np.ones(1, np.bool_)
     near_raw, span_raw = np.zeros((1, 1), np.uint16), np.zeros((1, 1), np.uint16)
     window, rectangles = np.array((0, 0, 1, 1)), np.array([[0, 0, 0, 0]], np.int32)

@@ -16,12 +16,12 @@ T = from_xyz_rpy((0.3, -0.2, 0.7), (0.4, -1.1, 2.5))
 POINTS_M = np.random.default_rng(0).uniform((-1.0, -1.0, 0.2), (1.0, 1.0, 3.0), (200, 3))
 
 
-def test_points_move_as_a_transform_has_it() -> None:
+def test_moved_equals_the_transform() -> None:
     there_m = np.array([moved(rows_of(T), *point) for point in POINTS_M])
     np.testing.assert_allclose(there_m, apply(T, POINTS_M), atol=1e-12)
 
 
-def test_in_float32_they_stay_in_float32() -> None:
+def test_float32_stays_float32() -> None:
     points_m = POINTS_M.astype(np.float32)
     there_m = np.array([moved(rows_of_32(T), *point) for point in points_m])
     np.testing.assert_allclose(there_m, apply(T, points_m.astype(np.float64)), atol=1e-6)
@@ -31,7 +31,7 @@ def test_in_float32_they_stay_in_float32() -> None:
         assert place == pytest.approx(exact, abs=1e-4)
 
 
-def test_a_point_lies_where_the_camera_has_it_and_comes_back() -> None:
+def test_projection_equals_the_camera_and_is_inverted() -> None:
     pixels = np.array([project(x, y, 1.0 / z, LENS) for x, y, z in POINTS_M])
     np.testing.assert_allclose(pixels, CAMERA.project(POINTS_M), atol=1e-9)
     back_m = np.array([deproject(u, v, z, LENS) for (u, v), z in zip(pixels, POINTS_M[:, 2], strict=True)])

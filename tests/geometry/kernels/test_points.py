@@ -17,7 +17,7 @@ SHAPE = (9, 8, 7)
 
 
 def images(rng: np.random.Generator, height: int, width: int) -> tuple[NDArray[np.uint16], ...]:
-    """Depth, room, and the robot's band, in half of the pixels each."""
+    """Return depth, room and the robot's band, each in half of the pixels."""
     depth, room, near = rng.integers(0, 4000, (3, height, width)).astype(np.uint16)
     span = rng.integers(0, 2000, (height, width)).astype(np.uint16)
     return depth, room, near, span
@@ -25,7 +25,7 @@ def images(rng: np.random.Generator, height: int, width: int) -> tuple[NDArray[n
 
 @pytest.mark.parametrize("height", [1, ROWS_AT_ONCE, 3 * ROWS_AT_ONCE - 1, 3 * ROWS_AT_ONCE + 1])
 @pytest.mark.parametrize("width", [8, 61])
-def test_a_few_rows_at_a_time_are_the_whole_image_at_once(height: int, width: int) -> None:
+def test_a_few_rows_at_a_time_equal_the_whole_image(height: int, width: int) -> None:
     rng = np.random.default_rng(height * width)
     depth, room, near, span = images(rng, height, width)
     columns = np.sort(rng.integers(0, width + 1, (height, 2)), axis=1).astype(np.int32)

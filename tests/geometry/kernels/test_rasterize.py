@@ -30,7 +30,7 @@ DOUBT_PX = 2e-3
 
 @dataclass
 class Screen:
-    """A camera and what was drawn; the width is no multiple of 8."""
+    """A camera and its buffers; the width is not a multiple of 8."""
 
     width: int = 61
     height: int = 43
@@ -47,7 +47,7 @@ class Screen:
 
     @property
     def farthest_w(self) -> NDArray[np.float32]:
-        """Inverse depth; infinite where nothing was drawn."""
+        """Inverse depth; infinite for pixels without a surface."""
         w = self.buffer.picture(self.rectangles)[1]
         return np.where(w > NOTHING_FARTHEST, -w, np.float32(np.inf))
 
@@ -65,7 +65,7 @@ class Screen:
         over: Screen | None = None,
         farthest: bool = True,
     ) -> Screen:
-        """Draw all meshes, or the `chosen` over what `over` has drawn of the others, and the `farthest` when wanted."""
+        """Draw all meshes, or the `chosen` over the drawing `over` of the others; with `farthest`, both surfaces."""
         vertices = [mesh.vertices for mesh in meshes]
         offsets = offsets or [np.zeros_like(points) for points in vertices]
         nothing = np.zeros((0, 3), np.float32)
@@ -112,7 +112,7 @@ class Screen:
 
 
 class Window:
-    """The memory of a window, full of what must not be taken for a drawing, with a guard behind it."""
+    """The memory of a window, filled with values that must not be read as a drawing, with a guard after it."""
 
     STALE = np.float32(np.nan)
 
@@ -123,14 +123,14 @@ class Window:
         self.window = np.full(4, 5, np.int64)
 
     def check(self) -> None:
-        """Nothing was written behind the memory, and the window lies inside the picture."""
+        """Assert that nothing was written after the memory, and that the window is inside the image."""
         row, column, rows, stride = self.window.tolist()
         assert all(np.isnan(memory[self.size :]).all() for memory in self.memory)
         assert rows == 0 or 0 <= row < row + rows <= self.screen.height
         assert rows == 0 or 0 <= column < column + stride - LANES <= self.screen.width
 
     def picture(self, rectangles: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Both buffers as whole images (H, W), with nothing beside the rectangles."""
+        """Return both buffers as whole images (H, W), empty outside the rectangles."""
         row, column, rows, stride = self.window.tolist()
         shape = (self.screen.height, self.screen.width)
         out = np.full(shape, NOTHING_NEAREST, np.float32), np.full(shape, NOTHING_FARTHEST, np.float32)
@@ -143,7 +143,7 @@ class Window:
 
 
 def clipped(triangle: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """The triangles (3, 3) that are left of one beyond the near plane."""
+    """Return the triangles (3, 3) that remain of one beyond the near plane."""
     polygon = []
     for a, b in zip(triangle, np.roll(triangle, -1, axis=0), strict=True):
         if a[2] >= NEAR_M:
@@ -154,7 +154,7 @@ def clipped(triangle: NDArray[np.float64]) -> list[NDArray[np.float64]]:
 
 
 class Twin:
-    """The same in float64, pixel by pixel, by edge functions: lower and upper bounds of what may be drawn.
+    """The twin in float64, pixel by pixel, by edge functions: lower and upper bounds of the drawing.
 
     A pixel whose centre lies within DOUBT_PX of an edge *may* be covered by it, one that lies deeper inside *must* be.
     """
@@ -215,7 +215,7 @@ class Twin:
 
 
 def soup(rng: np.random.Generator, count: int, low: float = -0.2, high: float = 2.0) -> TriangleMesh:
-    """Triangles in front of the camera, across the near plane and behind it, some of them without an area."""
+    """Return triangles in front of the camera, across the near plane and behind it, some without an area."""
     middle = np.stack((rng.uniform(-1, 1, count), rng.uniform(-1, 1, count), rng.uniform(low, high, count)), axis=-1)
     corners = middle[:, None, :] + rng.normal(0.0, 0.25, (count, 3, 3))
     corners[::7, 2] = corners[::7, 1]
@@ -228,7 +228,7 @@ def random_pose(rng: np.random.Generator, distance_m: float) -> Transform:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_draws_what_the_twin_draws(seed: int) -> None:
+def test_drawing_equals_the_twin(seed: int) -> None:
     rng = np.random.default_rng(seed)
     mesh, pose = soup(rng, 40), from_xyz_rpy(rng.normal(0, 0.1, 3), rng.normal(0, 0.3, 3))
     screen = Screen().draw([mesh], [pose])
@@ -240,11 +240,11 @@ def test_draws_what_the_twin_draws(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("closed", [True, False])
-def test_draws_solids_as_the_twin_does(seed: int, closed: bool) -> None:
+def test_drawing_of_solids_equals_the_twin(seed: int, closed: bool) -> None:
     rng = np.random.default_rng(100 + seed)
     found = (box_mesh("box", (0.3, 0.2, 0.4)), sphere_mesh("ball", 0.2))
     meshes = [TriangleMesh(mesh.name, mesh.vertices, mesh.faces, closed) for mesh in found]
-    # The nearer ones are cut by the near plane.
+    # The near plane cuts the nearer ones.
     poses = [random_pose(rng, rng.uniform(0.1, 1.0)) for _ in meshes]
     offsets = [rng.normal(0.0, 1.0, mesh.vertices.shape).astype(np.float32) for mesh in meshes]
     screen = Screen().draw(meshes, poses, 0.02, offsets)
@@ -260,7 +260,7 @@ def test_corners_on_pixel_centres_and_flat_edges() -> None:
     points = np.column_stack(((pixels - (screen.cx, screen.cy)) / 40.0, np.ones(5)))
     mesh = TriangleMesh("flat", points, np.array([[0, 1, 2], [1, 3, 2], [1, 4, 3]]), closed=False)
     screen.draw([mesh], [np.eye(4)])
-    # Which pixels lie *on* the outline is decided by float32; what lies inside is sure, the seams with it.
+    # Rounding in float32 decides which pixels are *on* the outline; inside, seams included, all are drawn.
     y, x = np.mgrid[6:15, 11:30]
     assert screen.drawn[6:15, 11:30][x < y + 15].all()
     assert not screen.drawn[:5].any()
@@ -281,11 +281,11 @@ def test_no_mesh_and_meshes_out_of_view() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_rectangles_hold_what_was_drawn_and_clear_it(seed: int) -> None:
+def test_rectangles_contain_the_drawing_and_clear_it(seed: int) -> None:
     rng = np.random.default_rng(seed)
     ball = sphere_mesh("ball", 0.2)
     xyz = [(-0.7, 0, 1), (0.75, 0.05, 1), (0, -0.5, 1), (0, 0.55, 1), (*rng.normal(0, 0.1, 2), 0.5), (0, 0, 0.248)]
-    for position in xyz:  # at each edge of the picture, in its middle, and cut by the near plane
+    for position in xyz:  # at each edge of the image, in its middle, and cut by the near plane
         screen = Screen().draw([ball], [from_xyz_rpy(position, (0, 0, 0))])
         top, bottom, left, right = screen.rectangles[0]
         rows, columns = np.nonzero(screen.drawn)
@@ -297,8 +297,8 @@ def test_rectangles_hold_what_was_drawn_and_clear_it(seed: int) -> None:
         assert (right - left) <= np.ptp(columns) + 2
 
 
-def test_what_is_kept_and_what_is_drawn_over_it_are_as_if_drawn_together() -> None:
-    """Apart, overlapping, and beyond the picture; whatever the memory held before."""
+def test_drawing_over_a_kept_buffer_equals_drawing_together() -> None:
+    """Apart, overlapping, and beyond the image, for any previous content of the memory."""
     ball = sphere_mesh("ball", 0.2)
     for x in ([-0.4, 0.1, 0.4], [0.0, 0.05, 0.1], [-3.0, 0.0, 0.4], [0.4, -3.0, 3.0], [3.0, 3.0, -3.0]):
         poses = [from_xyz_rpy((x[n], 0.1 * n, 1.0 + 0.1 * n), (0, 0, 0)) for n in range(3)]
@@ -312,7 +312,7 @@ def test_what_is_kept_and_what_is_drawn_over_it_are_as_if_drawn_together() -> No
             assert (over.rectangles == together.rectangles).all()
 
 
-def test_the_span_of_a_row_is_that_of_all_that_are_asked_for() -> None:
+def test_the_span_of_a_row_covers_all_selected_rectangles() -> None:
     rectangles = np.array([[2, 20, 5, 40], [10, 30, 30, 60], [36, 36, 0, 60], [37, -1, 61, -1]], np.int32)
     for chosen, others in itertools.product(itertools.product([True, False], repeat=4), repeat=2):
         for y in (0, 2, 9, 10, 20, 21, 36, 40):
@@ -327,8 +327,8 @@ def test_the_span_of_a_row_is_that_of_all_that_are_asked_for() -> None:
 
 @pytest.mark.parametrize("columns", [LANES, 2 * LANES])
 @pytest.mark.parametrize("seed", range(3))
-def test_small_wide_and_large_triangles_are_those_of_the_twin(seed: int, columns: int) -> None:
-    """At the borders between the three ways, of all shapes and partly beyond the picture's edges."""
+def test_small_wide_and_large_triangles_equal_the_twin(seed: int, columns: int) -> None:
+    """At the borders between the three ways, of all shapes and partly beyond the edges of the image."""
     rng = np.random.default_rng(seed)
     screen = Screen(301, 203, 210.0)
     twin = Twin(screen)
@@ -372,7 +372,7 @@ def test_from_within_a_solid_only_its_back_is_seen() -> None:
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize("seed", range(6))
 def test_a_sphere_has_no_holes(seed: int, closed: bool) -> None:
-    """It is convex: each row and column of its picture is one piece, and each pixel's depth is the sphere's."""
+    """It is convex: each row and column of its image is one piece, and each pixel's depth is the sphere's."""
     rng = np.random.default_rng(seed)
     ball = sphere_mesh("ball", 0.4)
     assert len(ball.faces) > 1000
@@ -387,7 +387,7 @@ def test_a_sphere_has_no_holes(seed: int, closed: bool) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_neighbours_leave_no_gap(seed: int) -> None:
-    """A wall of crooked triangles, among them slivers, fills the whole picture."""
+    """A wall of crooked triangles, among them slivers, fills the whole image."""
     rng = np.random.default_rng(seed)
     screen = Screen(301, 203, 210.0)
     u, v = np.meshgrid(np.linspace(-10, 310, 40), np.linspace(-10, 212, 31))
@@ -433,13 +433,13 @@ def floor_grid(rng: np.random.Generator, cells: int) -> TriangleMesh:
 
 @pytest.mark.parametrize("cells", [1, 2, 3, 40, 200])
 def test_a_floor_that_runs_beneath_the_camera_is_cut_not_lost(cells: int) -> None:
-    """Its diagonals run into the camera: their pictures are columns and rows of pixels."""
+    """Its diagonals run into the camera: their images are columns and rows of pixels."""
     screen = Screen(301, 203, 100.0).draw([floor_grid(np.random.default_rng(cells), cells)], [np.eye(4)])
     y = np.arange(203)
     z = 0.3 * 100.0 / np.maximum(y - screen.cy, 1e-9)
     below = (z > NEAR_M) & (z < 8.9)
     assert screen.drawn[below].all()
-    # In w, which is linear on the screen: what a shift by DOUBT_PX makes.
+    # In w, which is linear on the screen: the effect of a shift by DOUBT_PX.
     assert np.abs(screen.nearest_w[below] - 1.0 / z[below, None]).max() < DOUBT_PX / (0.3 * 100.0)
     assert not screen.drawn[y < screen.cy].any()
 

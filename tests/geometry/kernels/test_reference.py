@@ -41,7 +41,7 @@ class Learner:
 
 @dataclass
 class PixelTwin:
-    """One pixel, with all depths of each mode kept."""
+    """The twin of one pixel, which keeps all depths of each mode."""
 
     looks: int = 0
     modes: list[list[float]] = field(default_factory=list)
@@ -76,11 +76,11 @@ class PixelTwin:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_learns_what_the_twin_learns(seed: int) -> None:
+def test_learning_equals_the_twin(seed: int) -> None:
     rng = np.random.default_rng(seed)
     shape = (9, 13)
     learner, twins = Learner(shape), [[PixelTwin() for _ in range(shape[1])] for _ in range(shape[0])]
-    # Surfaces lie far enough apart that no depth is at the reach of a mode by a hair; a few pixels have more than fit.
+    # Surfaces are so far apart that no depth is near the limit of a mode; a few pixels have more than fit.
     surfaces = np.sort(rng.choice(np.arange(500, 8000, 1500), (*shape, 3)), axis=-1)
     share = rng.dirichlet((0.7, 0.7, 0.7, 0.4), shape)
     for _ in range(60):
@@ -107,7 +107,7 @@ def constant(raw: int, shape: tuple[int, int] = (1, 1)) -> Image:
     return np.full(shape, raw, np.uint16)
 
 
-def test_no_frame_or_nothing_but_holes_teaches_nothing() -> None:
+def test_no_frame_or_only_holes_learn_nothing() -> None:
     learner = Learner((2, 3))
     assert np.isnan(learner.conclude()).all()
     learner.add(constant(0, (2, 3)))
@@ -116,8 +116,8 @@ def test_no_frame_or_nothing_but_holes_teaches_nothing() -> None:
 
 
 @pytest.mark.parametrize("background", [0, 2500, 7000])
-def test_who_walks_past_is_not_learned(background: int) -> None:
-    """Nor where the empty cell shows nothing, or something beyond the range."""
+def test_a_passing_person_is_not_learned(background: int) -> None:
+    """Also for a pixel whose background gives no measurement, or one beyond the range."""
     learner = Learner((1, 1))
     for frame in range(100):
         learner.add(constant(1200 if 40 <= frame < 50 else background))
@@ -125,8 +125,8 @@ def test_who_walks_past_is_not_learned(background: int) -> None:
     assert np.isnan(learned) if background != 2500 else learned == pytest.approx(2.5)
 
 
-def test_who_walks_past_while_the_robot_hides_the_rest_is_not_learned() -> None:
-    """The robot covers the pixel for most of the time; only the looks past it count, and most showed a hole."""
+def test_a_person_who_passes_while_the_robot_hides_the_rest_is_not_learned() -> None:
+    """The robot covers the pixel most of the time; only looks past it count, and most had no measurement."""
     learner = Learner((1, 1))
     robot = constant(1000), constant(300)
     for frame in range(200):
@@ -145,8 +145,8 @@ def test_an_edge_keeps_its_nearer_surface() -> None:
     assert learner.conclude()[0][0, 0] == pytest.approx(1.5)
 
 
-def test_what_is_seen_past_the_robot_is_learned() -> None:
-    """Before and behind its band, and where it is not."""
+def test_surfaces_seen_past_the_robot_are_learned() -> None:
+    """Before and behind its band, and beside it."""
     for raw in (999, 1301, 2000):
         learner = Learner((1, 1))
         learner.add(constant(raw), constant(1000), constant(300))
@@ -169,7 +169,7 @@ def test_few_frames_have_the_cameras_own_spread() -> None:
 
 
 @pytest.mark.parametrize("freedom", [9.0, 20.0, 63.0, 1000.0])
-def test_few_frames_widen_the_spread_as_students_t_has_it(freedom: float) -> None:
+def test_few_frames_widen_the_spread_by_students_t(freedom: float) -> None:
     beyond = stats.norm.sf(4.0)
     assert students_excess(freedom) == pytest.approx(stats.t.isf(beyond, freedom) / 4.0, rel=0.1)
 

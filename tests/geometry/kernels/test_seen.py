@@ -64,9 +64,9 @@ def views_twin(lattice: Lattice, T_world_camera: Transform, camera: Intrinsics =
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_views_are_those_of_the_twin(seed: int) -> None:
+def test_views_equal_the_twin(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    eye = rng.normal(0.0, 1.0, 3)  # now and then inside the lattice
+    eye = rng.normal(0.0, 1.0, 3)  # sometimes inside the lattice
     pose = look_at(eye, rng.normal(0.0, 0.3, 3)) @ from_xyz_rpy((0, 0, 0), (0, 0, rng.uniform(-3, 3)))
     number, blocks, rectangles = views(LATTICE, pose)
     wanted = views_twin(LATTICE, pose)
@@ -120,17 +120,17 @@ def look_twin(
 @pytest.mark.parametrize("share", [0.5, 0.9, 1.0])
 @pytest.mark.parametrize("apart", [1, 2, 3])
 @pytest.mark.parametrize("seed", range(4))
-def test_seen_is_that_of_the_twin(seed: int, apart: int, share: float) -> None:
+def test_seen_equals_the_twin(seed: int, apart: int, share: float) -> None:
     rng = np.random.default_rng(seed)
     images = [rng.choice(np.array([0, 1500, 1700, 1900, 65535], np.uint16), CAMERA.shape) for _ in range(3)]
-    # Whole regions, else next to nothing would be seen.
+    # Whole regions, since otherwise almost nothing would be seen.
     for image in images:
         image[:, rng.integers(0, 60) :] = 65535
     seen = look(*images, share, apart)
     assert (seen == look_twin(*images, share, apart)).all()
 
 
-def test_what_hides_a_block() -> None:
+def test_occlusions_of_a_block() -> None:
     far, none = np.full(CAMERA.shape, 65535, np.uint16), np.zeros(CAMERA.shape, np.uint16)
     near = np.full(CAMERA.shape, 100, np.uint16)
     everything = look(far, far, far)

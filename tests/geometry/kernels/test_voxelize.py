@@ -14,7 +14,7 @@ DOUBT_VOXELS = 1e-3
 
 
 class Counter:
-    """The kernel with its memory: the lattice, a rim about it, a slot for what lies outside, and a guard behind."""
+    """The kernel with its memory: the lattice, a rim around it, a slot for points outside, and a guard after it."""
 
     def __init__(self, shape: tuple[int, int, int], pixels: int) -> None:
         self.shape = shape
@@ -36,7 +36,7 @@ class Counter:
         row_rays: NDArray[np.float32],
         origin: NDArray[np.float32],
     ) -> NDArray[np.uint32]:
-        """`column_rays` (W, 3) here, as `row_rays` (H, 3)."""
+        """Run the kernel; `column_rays` is (W, 3) here, as `row_rays` is (H, 3)."""
         height, width = depth.shape
         padded = np.zeros((height, -(-width // 8) * 8), np.uint8)
         padded[:, :width] = mask
@@ -65,7 +65,7 @@ def positions(
     row_rays: NDArray[np.float32],
     origin: NDArray[np.float32],
 ) -> NDArray[np.float64]:
-    """Where each pixel lies (H, W, 3), in units of voxels."""
+    """Return the position of each pixel (H, W, 3), in units of voxels."""
     rays = column_rays.astype(np.float64)[None, :, :] + row_rays.astype(np.float64)[:, None, :]
     return np.asarray(rays * depth[:, :, None] + origin)
 
@@ -81,7 +81,7 @@ def twin(points: NDArray[np.float64], mask: NDArray[np.bool_], shape: tuple[int,
 def rays(
     rng: np.random.Generator, height: int, width: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """A camera that looks anywhere, with the lattice's corner inside its view: half of the points are negative."""
+    """Return the rays of a camera in any direction that sees the lattice's corner: half of the points are negative."""
     column = rng.normal(0.0, 0.01, (width, 3)).astype(np.float32)
     row = rng.normal(0.0, 0.01, (height, 3)).astype(np.float32)
     return column, row, rng.normal(4.0, 4.0, 3).astype(np.float32)
@@ -89,7 +89,7 @@ def rays(
 
 @pytest.mark.parametrize("width", [1, 7, 8, 61, 96])
 @pytest.mark.parametrize("shape", [(20, 15, 12), (1, 1, 1), (3, 40, 1)])
-def test_counts_what_the_twin_counts(width: int, shape: tuple[int, int, int]) -> None:
+def test_counts_equal_the_twin(width: int, shape: tuple[int, int, int]) -> None:
     rng = np.random.default_rng(width)
     height = 41
     counter = Counter(shape, height * width)
@@ -113,7 +113,7 @@ def test_no_pixel_is_marked() -> None:
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_border_belongs_to_the_voxel_above_and_the_last_one_to_none(axis: int) -> None:
+def test_a_border_belongs_to_the_voxel_above_and_the_last_border_to_none(axis: int) -> None:
     """All numbers are exact in float32: pixels 1/4 voxel apart along an axis, from -1 to 5, on a lattice of 4."""
     depth = np.full((1, 25), 4, np.uint16)
     column = np.zeros((25, 3), np.float32)

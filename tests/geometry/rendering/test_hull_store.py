@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hulls on disk: the same as made anew, whole or not there, bounded, and never what a unit fails of."""
+"""Hulls on disk: equal to new ones, complete or absent, bounded, and never a cause of failure of a unit."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def made(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The names of the meshes of which hulls were made, into `folder`; each `start` is one of a unit."""
+    """Record the names of the meshes whose hulls are made, in `folder`; each `start` is a start of a unit."""
     names: list[str] = []
     make = padded_hull._make_hull
 
@@ -51,7 +51,7 @@ def same(one: TriangleMesh, other: TriangleMesh) -> bool:
     return one.to_bytes() == other.to_bytes()
 
 
-def test_the_second_start_finds_what_the_first_made(
+def test_the_second_start_loads_the_hulls_of_the_first(
     folder: Path, made: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = hull_around(sphere_mesh("ball", 0.2), HULL_M)
@@ -78,7 +78,7 @@ def test_another_mesh_distance_or_code_has_another_hull(
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "bit", "other's", "no mesh"])
-def test_a_damaged_file_is_taken_out_and_made_anew(
+def test_a_damaged_file_is_removed_and_made_again(
     folder: Path, made: list[str], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, damage: str
 ) -> None:
     mesh = box_mesh("box", (0.1, 0.1, 0.1))
@@ -98,11 +98,13 @@ def test_a_damaged_file_is_taken_out_and_made_anew(
     start(monkeypatch, folder)
     assert same(hull_around(mesh, HULL_M), first)
     assert made == ["box"]
-    assert f"{file}: damaged, the hull of box is made anew" in caplog.text
+    assert f"{file}: damaged, so the hull of box is made again" in caplog.text
     assert file.read_bytes() == content
 
 
-def test_those_not_used_for_longest_go_first(folder: Path, made: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_least_recently_used_hulls_are_removed_first(
+    folder: Path, made: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     meshes = [box_mesh(f"box {number}", (0.1, 0.1, 0.1 + 0.1 * number)) for number in range(4)]
     monkeypatch.setattr(hull_store, "FILES_MAX", 3)
     for number, mesh in enumerate(meshes[:3]):
@@ -163,7 +165,7 @@ def test_a_folder_that_cannot_be_made_is_a_warning_once(
     assert len(caplog.records) == 1
 
 
-def test_the_state_of_the_code_tells_sources_and_libraries_apart(tmp_path: Path) -> None:
+def test_the_state_of_the_code_distinguishes_sources_and_libraries(tmp_path: Path) -> None:
     one, other = tmp_path / "one.py", tmp_path / "other.py"
     one.write_text("a = 1")
     other.write_text("b = 1")
@@ -178,13 +180,13 @@ def test_the_state_of_the_code_tells_sources_and_libraries_apart(tmp_path: Path)
     assert state_of_code((one,), ("library 1",)) in states
 
 
-def test_they_lie_beside_the_kernels(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_hulls_are_stored_beside_the_kernels(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels-0123456789ab"))
     assert folder_beside("hulls") == tmp_path / "hulls"
 
 
 def test_units_that_start_together_do_not_disturb_one_another(folder: Path) -> None:
-    """Each writes all hulls; no write fails by another's, and what is there in the end is whole."""
+    """Each unit writes all hulls; no write fails because of another, and in the end all files are complete."""
     keep = """
 import logging, sys
 from pathlib import Path
@@ -214,7 +216,7 @@ for number in range(150):
         for unit in units:
             assert unit.stdout is not None
             assert unit.stdout.readline() == "ready\n"
-        # communicate() would let the first begin alone.
+        # communicate() would let the first start alone.
         for unit in units:
             assert unit.stdin is not None
             unit.stdin.write("go\n")

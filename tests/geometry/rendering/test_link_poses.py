@@ -14,7 +14,7 @@ from tests.edge_unit.scenes import ABOVE_TABLE, demo_cell, small_robot
 
 
 def mixed(rng: np.random.Generator) -> Robot:
-    """Two branches, turning and sliding joints, one that follows another, links on the base and on joints."""
+    """Return a robot with two branches, revolute, prismatic and mimic joints, and links on the base and on joints."""
     parents, dofs = (BASE, 0, 1, 1, BASE), (1, 0, 2, 2, 3)
     axes = rng.normal(0.0, 1.0, (5, 3))
     motions = [
@@ -38,7 +38,7 @@ def mixed(rng: np.random.Generator) -> Robot:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_links_stand_where_the_robots_own_arithmetic_has_them(seed: int) -> None:
+def test_poses_equal_those_of_the_robot(seed: int) -> None:
     rng = np.random.default_rng(seed)
     demo = demo_cell().robot
     assert demo is not None

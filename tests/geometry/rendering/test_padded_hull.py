@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solid around a link: at the right distance, closed, and small, whatever the mesh was like."""
+"""The solid around a link: at the right distance, closed, and small, for any mesh."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HULL_M = 0.05
 DEMO_CELL = "assets/cells/demo/cell.yaml"
 
 TOLERANCE_M = 0.0035
-"""Of the grid, the surface net and the simplification together."""
+"""Tolerance of the grid, the surface net and the simplification together."""
 
 
 def solid(mesh: TriangleMesh) -> trimesh.Trimesh:
@@ -38,7 +38,7 @@ def distances_m(hull: TriangleMesh, mesh: TriangleMesh) -> np.ndarray:
     [box_mesh("box", (0.1, 0.05, 0.3)), cylinder_mesh("cylinder", 0.04, 0.2), sphere_mesh("sphere", 0.06)],
     ids=["box", "cylinder", "sphere"],
 )
-def test_it_lies_at_its_distance(mesh: TriangleMesh) -> None:
+def test_the_hull_is_at_its_distance(mesh: TriangleMesh) -> None:
     hull = hull_around(mesh, HULL_M)
     assert np.abs(distances_m(hull, mesh) - HULL_M).max() < TOLERANCE_M
 
@@ -76,7 +76,7 @@ def test_a_closed_shell_is_filled() -> None:
     assert hull.volume > 0.3**3
 
 
-def test_it_is_simple() -> None:
+def test_the_hull_has_few_triangles() -> None:
     fine = sphere_mesh("sphere", 0.1)
     for _ in range(2):
         dense = solid(fine).subdivide()
@@ -104,7 +104,7 @@ def test_samples_cover_a_triangle() -> None:
     assert nearest.max() <= 0.003
 
 
-def test_samples_are_the_same_however_many_are_taken_at_once() -> None:
+def test_samples_do_not_depend_on_the_number_taken_at_once() -> None:
     mesh = box_mesh("box", (0.1, 0.02, 0.3))
     number = kernels.sample_faces(mesh.vertices, mesh.faces, 0.004, 0, np.empty((0, 3), np.float32))
     every = np.empty((number, 3), np.float32)
@@ -118,7 +118,7 @@ def test_samples_are_the_same_however_many_are_taken_at_once() -> None:
 
 
 def test_a_mesh_that_is_sampled_in_parts_is_no_farther(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a grain that lies in several parts each gives a sample; all that there were otherwise are among them."""
+    """Each part gives a sample of a grain in several parts; all samples of a single pass are among them."""
     mesh = cylinder_mesh("cylinder", 0.1, 0.4)
     grid = np.full(3, -0.2, np.float32), np.array((50, 50, 70)), 0.25 * HULL_M, HULL_M
     whole_m = padded_hull._distance(mesh, *grid)
@@ -131,7 +131,7 @@ def test_a_mesh_that_is_sampled_in_parts_is_no_farther(monkeypatch: pytest.Monke
 
 
 def slivers(number: int) -> TriangleMesh:
-    """A cylinder of 1.2 m, as CAD has it: two long triangles for each of many sides."""
+    """Return a cylinder of 1.2 m as in CAD: two long triangles for each of many sides."""
     turn = np.linspace(0.0, 2.0 * np.pi, number, endpoint=False)
     ring = 0.3 * np.stack((np.cos(turn), np.sin(turn)), axis=1)
     vertices = np.vstack([np.column_stack((ring, np.full(number, z))) for z in (0.0, 1.2)]).astype(np.float32)
@@ -169,7 +169,7 @@ def test_distances_are_those_of_the_nearest_sample() -> None:
     np.testing.assert_allclose(np.sqrt(squared), np.minimum(twin, 0.02), atol=1e-5)
 
 
-def test_outside_is_what_can_be_walked_to() -> None:
+def test_outside_is_connected_with_the_corner() -> None:
     inside = np.zeros((9, 9, 9), np.bool_)
     inside[2:7, 2:7, 2:7] = True
     inside[3:6, 3:6, 3:6] = False
@@ -201,6 +201,6 @@ def test_an_empty_field_has_no_surface() -> None:
     assert kernels.surface_net(field, np.empty(field.shape, np.int32), *none) == (0, 0)
 
 
-def test_too_near_a_hull_is_refused() -> None:
+def test_a_distance_below_the_least_is_refused() -> None:
     with pytest.raises(InputError, match=f"box.*at least {DISTANCE_MIN_M} m"):
         hull_around(box_mesh("box", (0.1, 0.1, 0.1)), 0.001)

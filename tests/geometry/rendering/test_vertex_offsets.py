@@ -16,7 +16,7 @@ SOLIDS = [box_mesh("box", (0.3, 0.2, 0.1)), sphere_mesh("sphere", 0.1), cylinder
 
 
 def seen_from_around(shape: trimesh.Trimesh, count: int = 3000) -> NDArray[np.float64]:
-    """Where rays from all around first meet the surface: the inner faces of joined parts do not count."""
+    """Return the first hits of rays from all directions; inner faces of joined parts do not count."""
     rng = np.random.default_rng(0)
     low, high = shape.bounds
     targets = rng.uniform(low, high, (4 * count, 3))
@@ -27,7 +27,7 @@ def seen_from_around(shape: trimesh.Trimesh, count: int = 3000) -> NDArray[np.fl
 
 
 def growth_m(mesh: TriangleMesh, padding_m: float) -> NDArray[np.float64]:
-    """Distances of points all over the inflated surface from the original one."""
+    """Return the distances of points all over the inflated surface from the original one."""
     inflated = trimesh.Trimesh(mesh.vertices + padding_m * vertex_offsets(mesh), mesh.faces, process=False)
     original = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     return np.asarray(trimesh.proximity.closest_point(original, seen_from_around(inflated))[1])
@@ -48,7 +48,7 @@ def test_faces_of_a_box_move_by_the_padding_itself() -> None:
     assert np.allclose(np.ptp(inflated, axis=0), (0.36, 0.26, 0.16), atol=5e-4)
 
 
-def test_the_tip_of_a_needle_does_not_run_away() -> None:
+def test_the_motion_of_a_needles_tip_is_bounded() -> None:
     cone = trimesh.creation.cone(radius=0.002, height=0.3, sections=16)
     mesh = TriangleMesh.of_triangles("needle", cone.vertices, cone.faces)
     assert np.linalg.norm(vertex_offsets(mesh), axis=1).max() <= OFFSET_MAX + 1e-6

@@ -26,7 +26,8 @@ from shared.clock import NS_PER_S
 from shared.errors import Refusal
 from shared.messages import JointsRequest
 from shared.waiting import within
-from tests.master_server.fakes import MS, START_NS, FakeUnit, SetClock, joined, master, sees_all
+from tests.master_server.fakes import MS, START_NS, FakeUnit, joined, master, sees_all
+from tests.set_clock import SetClock
 
 KEYS = Wish("keys")
 

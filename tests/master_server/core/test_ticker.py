@@ -13,7 +13,8 @@ from master_server.core.ticker import TICK_NS
 from master_server.core.units import COMMAND_EXPIRES_S
 from shared.clock import NS_PER_S
 from shared.settings import Settings
-from tests.master_server.fakes import MS, START_NS, S, SetClock, joined, master, sees_all
+from tests.master_server.fakes import MS, START_NS, S, joined, master, sees_all
+from tests.set_clock import SetClock
 
 
 def states(caplog: pytest.LogCaptureFixture) -> list[str]:

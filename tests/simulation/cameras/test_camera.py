@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras in the world: the same frame wherever it is rendered, and rigs of any size."""
+"""Cameras in the world: equal frames in all processes, and rigs of any size."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_unknown_profiles_and_rig_sizes_are_refused(world: World) -> None:
             rig(world.cell, count)
 
 
-def test_a_rig_looks_into_the_cell_from_different_places(world: World) -> None:
+def test_a_rig_sees_the_cell_from_different_positions(world: World) -> None:
     poses = rig(world.cell, MAX_RIG)
     for pose in poses:
         validated(pose, "pose")
@@ -75,7 +75,7 @@ def test_a_rig_looks_into_the_cell_from_different_places(world: World) -> None:
     assert {tuple(np.sign(place[:2])) for place in places[:4]} == {(-1, -1), (1, 1), (1, -1), (-1, 1)}
 
 
-def test_four_cameras_together_see_all_of_the_cell_s_owners(world: World) -> None:
+def test_four_cameras_together_see_all_owners(world: World) -> None:
     seen: set[int] = set()
     for pose in rig(world.cell, 4):
         frame = SimulatedCamera(world, pose, d435i_intrinsics(424, 240)).capture(0.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The faults of the simulated camera are as strong as those that were measured, and each can be switched off."""
+"""The faults of the simulated camera have the measured strength, and each can be switched off."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MEASURED_MM = ((0.7, 1.0, 4.8), (1.0, 1.5, 8.7), (1.5, 2.0, 21.0), (2.0, 3.0, 33
 
 
 def only(**faults: object) -> DepthNoise:
-    """No fault but these."""
+    """Return a configuration with only these faults."""
     return DepthNoise.model_validate({**DepthNoise.none().model_dump(), **faults})
 
 
@@ -30,7 +30,7 @@ def plane(z_m: float, camera: Intrinsics = CAMERA) -> NDArray[np.float32]:
 
 
 def step(near_m: float, far_m: float, camera: Intrinsics = CAMERA) -> NDArray[np.float32]:
-    """A post of `near_m` in the middle of a wall at `far_m`."""
+    """Return the view of a post at `near_m` in the middle of a wall at `far_m`."""
     z_m = plane(far_m, camera)
     z_m[:, camera.width // 2 - 20 : camera.width // 2 + 20] = near_m
     return z_m
@@ -39,7 +39,7 @@ def step(near_m: float, far_m: float, camera: Intrinsics = CAMERA) -> NDArray[np
 def measured(
     noise: DepthNoise, z_m: NDArray[np.float32], frames: int = 1, camera: Intrinsics = CAMERA, seed: int = 0
 ) -> NDArray[np.float64]:
-    """Depth (frames, H, W) in metres, NaN where nothing was measured."""
+    """Return depth (frames, H, W) in metres, NaN for pixels without a measurement."""
     sensor = DepthSensor(camera, noise, seed)
     raw = np.stack([sensor.measure(z_m, moment) for moment in range(frames)])
     return np.where(raw == 0, np.nan, raw * camera.depth_scale_m)
@@ -56,7 +56,7 @@ def test_noise_is_as_measured_on_real_frames(low_m: float, high_m: float, sigma_
     assert np.median(deviations) * 1000.0 == pytest.approx(sigma_mm, rel=0.15)
 
 
-def test_noise_is_normal_and_as_told_at_the_nodes_of_the_table() -> None:
+def test_noise_is_normal_and_as_configured_at_the_nodes_of_the_table() -> None:
     noise = DepthNoise(hole_share=0.0, disparity_step_px=0.0)
     error_m = measured(noise, plane(1.25), frames=40) - 1.25
     assert error_m.std() == pytest.approx(0.0087, rel=0.03)
@@ -81,12 +81,12 @@ def test_beyond_the_table_noise_grows_with_the_square_of_depth() -> None:
 def test_noise_is_smooth_over_a_few_pixels_and_new_in_each_frame() -> None:
     error_m = measured(DepthNoise(hole_share=0.0), plane(1.2), frames=30) - 1.2
 
-    def likeness(shift: int) -> float:
+    def correlation(shift: int) -> float:
         return float((error_m[:, :, shift:] * error_m[:, :, : 160 - shift]).mean() / (error_m**2).mean())
 
-    assert 0.8 < likeness(1) < 0.95
-    assert 0.35 < likeness(6) < 0.65
-    assert abs(likeness(20)) < 0.05
+    assert 0.8 < correlation(1) < 0.95
+    assert 0.35 < correlation(6) < 0.65
+    assert abs(correlation(20)) < 0.05
     assert abs((error_m[1:] * error_m[:-1]).mean() / (error_m**2).mean()) < 0.05
 
 
@@ -102,7 +102,7 @@ def test_a_perfect_camera_only_rounds() -> None:
     np.testing.assert_allclose(measured(DepthNoise.none(), z_m)[0], z_m, atol=CAMERA.depth_scale_m * 0.51)
 
 
-def test_what_is_too_near_too_far_or_nowhere_is_not_measured() -> None:
+def test_points_too_near_too_far_or_absent_are_not_measured() -> None:
     noise = only(disparity_max_px=126.0, range_max_m=4.0)
     nearest_m = 425.0 * 0.05 / 126.0
     for z_m, seen in ((nearest_m - 0.001, False), (nearest_m + 0.001, True), (3.999, True), (4.001, False)):
@@ -114,7 +114,7 @@ def test_what_is_too_near_too_far_or_nowhere_is_not_measured() -> None:
 
 
 @pytest.mark.parametrize("near_m", [0.8, 1.2, 2.0])
-def test_near_things_grow_by_some_thirty_millimetres_at_their_own_depth(near_m: float) -> None:
+def test_near_objects_grow_by_about_thirty_millimetres_at_their_own_depth(near_m: float) -> None:
     z_m = step(near_m, 3.5)
     grown = np.abs(measured(only(halo_m=0.03, halo_ragged=0.4), z_m, frames=30) - near_m) < 0.01
     rows = slice(20, 100)
@@ -125,7 +125,7 @@ def test_near_things_grow_by_some_thirty_millimetres_at_their_own_depth(near_m: 
     assert (width_m < 0.03 * 1.4 + near_m / 425.0).all()
 
 
-def test_the_halo_covers_what_is_behind_only() -> None:
+def test_the_halo_covers_only_the_background() -> None:
     z_m = plane(2.0)
     z_m[30:60, 40:80] = 1.0
     z_m[:, 90:] = np.inf
@@ -136,7 +136,7 @@ def test_the_halo_covers_what_is_behind_only() -> None:
     assert np.isnan(depth_m[0, 100:]).all()
 
 
-def test_growing_is_what_its_slow_twin_says() -> None:
+def test_growth_equals_the_twin() -> None:
     rng = np.random.default_rng(3)
     z_m = rng.choice(np.array((0.8, 1.0, 1.02, 2.0, np.inf), dtype=np.float32), (24, 30), p=(0.02, 0.1, 0.1, 0.68, 0.1))
     field = rng.normal(size=z_m.shape).astype(np.float32)
@@ -157,7 +157,7 @@ def test_growing_is_what_its_slow_twin_says() -> None:
     assert (grown != z_m).sum() > 50
 
 
-def test_the_left_side_of_near_things_throws_a_shadow_as_wide_as_the_disparities_differ() -> None:
+def test_near_objects_have_a_shadow_on_the_left_as_wide_as_the_disparities_differ() -> None:
     depth_m = measured(only(shadow=True), step(1.0, 2.0))[0]
     width_px = round(425.0 * 0.05 * (1.0 / 1.0 - 1.0 / 2.0))
     hidden = np.isnan(depth_m).all(axis=0)
@@ -186,7 +186,7 @@ def test_surfaces_at_a_grazing_angle_fade() -> None:
         """Share of holes in the middle of a plane that is turned by `incidence_deg` about the camera's x axis."""
         slope = math.tan(math.radians(incidence_deg))
         z_m = np.broadcast_to(1.5 / (1.0 - slope * v * 0.2), CAMERA.shape)
-        # Only rows near the middle have this incidence; the factor keeps the rest in front of the camera.
+        # Only rows near the middle have this incidence; the factor keeps the others in front of the camera.
         middle = np.where(np.abs(v) < 0.02, 1.5 / (1.0 - slope * v), z_m).astype(np.float32)
         return float(np.isnan(measured(only(grazing_from_deg=80.0), middle, frames=4)[:, 55:65]).mean())
 
@@ -195,7 +195,7 @@ def test_surfaces_at_a_grazing_angle_fade() -> None:
     assert unseen(85.0) < unseen(88.0)
 
 
-def test_holes_take_the_share_that_was_told_and_mostly_stay_where_they_are() -> None:
+def test_holes_have_the_configured_share_and_mostly_stay_in_place() -> None:
     large = Intrinsics(848, 480, 425.0, 425.0, 423.5, 239.5)
     noise = only(hole_share=0.02)
     holes = np.isnan(measured(noise, plane(1.5, large), frames=12, camera=large))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Both renderers draw the same true depth, and the depth of plain shapes is what geometry says."""
+"""Both renderers draw the same true depth, and simple shapes have their analytic depth."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_robot_and_furniture_agree_within_a_tenth_of_a_millimetre() -> None:
         for t_s in (0.3, 2.9):
             ours, theirs = raster.render(world.scene(t_s)), raycast.render(world.scene(t_s))
             difference = np.abs(ours.z_m - theirs.z_m)
-            # The others lie on an edge, which each renderer may give to either side.
+            # The others are on an edge, which each renderer may assign to either side.
             assert (difference < 1e-4).mean() > 0.9995
             assert (ours.owner == theirs.owner).mean() > 0.9995
 
@@ -105,7 +105,7 @@ def test_a_box_that_reaches_behind_the_camera_does_not_vanish() -> None:
     np.testing.assert_allclose(ours.z_m, theirs.z_m, rtol=1e-4)
 
 
-def test_what_is_fixed_is_drawn_again_when_it_changes() -> None:
+def test_fixed_bodies_are_drawn_again_after_a_change() -> None:
     near = Body("near", box_mesh("near", (1.0, 1.0, 0.1)), from_xyz_rpy((0, 0, 1.0), (0, 0, 0)), Owner.STATIC)
     far = Body("far", box_mesh("far", (9.0, 9.0, 0.1)), from_xyz_rpy((0, 0, 3.0), (0, 0, 0)), Owner.OBJECT)
     for renderer in pair(SMALL, look_at((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))):
@@ -115,5 +115,5 @@ def test_what_is_fixed_is_drawn_again_when_it_changes() -> None:
         assert first.z_m[centre] == pytest.approx(0.95)
         assert renderer.render(one).z_m[centre] == pytest.approx(2.95)
         assert renderer.render(both).owner[centre] == Owner.STATIC
-        # The arrays are the caller's: later frames leave them alone.
+        # The arrays belong to the caller: later frames do not change them.
         assert first.z_m[centre] == pytest.approx(0.95)

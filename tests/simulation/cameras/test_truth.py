@@ -23,7 +23,7 @@ LATTICE = Lattice((-0.8, -0.7, 0.2), 0.1, (16, 14, 18))
 
 
 def random_view(seed: int) -> View:
-    """Flat patches of all owners at random depths."""
+    """Return a view with flat patches of all owners at random depths."""
     rng = np.random.default_rng(seed)
     z_m = np.kron(rng.uniform(0.4, 2.2, (6, 8)), np.ones((8, 8))) + rng.uniform(0.0, 0.03, CAMERA.shape)
     owner = np.kron(rng.choice([int(owner) for owner in Owner], (6, 8)), np.ones((8, 8), dtype=np.uint8))
@@ -41,7 +41,7 @@ def points_world(z_m: NDArray[Any], pose: Transform) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_visible_voxels_are_what_their_slow_twin_says(seed: int) -> None:
+def test_visible_voxels_equal_the_twin(seed: int) -> None:
     rng = np.random.default_rng(seed)
     view = random_view(seed)
     pose = look_at((0.1, 0.05, -0.1), (0.0, 0.0, 1.0), (0.1, -1.0, 0.0))
@@ -69,7 +69,7 @@ def test_visible_voxels_are_what_their_slow_twin_says(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_surface_voxels_hold_the_true_points_and_reach_along_the_rays_as_far_as_noise(seed: int) -> None:
+def test_surface_voxels_contain_the_true_points_and_extend_along_the_rays_by_the_noise(seed: int) -> None:
     view, noise = random_view(seed), DepthNoise()
     truth = TruthFinder(CAMERA, identity(), LATTICE, noise).find(view)
     unknown = view.owner >= Owner.PERSON
@@ -91,7 +91,7 @@ def test_surface_voxels_hold_the_true_points_and_reach_along_the_rays_as_far_as_
     assert set(LATTICE.keys(indices[unknown & LATTICE.contains(indices)]).tolist()) <= found
 
 
-def test_without_noise_the_surface_is_where_the_points_are() -> None:
+def test_without_noise_the_surface_consists_of_the_points_voxels() -> None:
     view = random_view(5)
     truth = TruthFinder(CAMERA, identity(), LATTICE, DepthNoise.none()).find(view)
     assert set(truth.visible_keys.tolist()) <= set(truth.surface_keys.tolist())
@@ -100,7 +100,7 @@ def test_without_noise_the_surface_is_where_the_points_are() -> None:
     np.testing.assert_array_equal(truth.surface_keys, np.unique(LATTICE.keys(indices[inside])))
 
 
-def test_finding_twice_finds_the_same() -> None:
+def test_a_second_search_gives_the_same_result() -> None:
     finder = TruthFinder(CAMERA, identity(), LATTICE, DepthNoise())
     first = finder.find(random_view(1))
     finder.find(random_view(2))
@@ -109,7 +109,7 @@ def test_finding_twice_finds_the_same() -> None:
     np.testing.assert_array_equal(first.visible_keys, again.visible_keys)
 
 
-def test_nothing_unknown_nothing_visible() -> None:
+def test_without_unknown_objects_nothing_is_visible() -> None:
     view = View(np.full(CAMERA.shape, 1.0, np.float32), np.full(CAMERA.shape, Owner.ROBOT, np.uint8))
     truth = TruthFinder(CAMERA, identity(), LATTICE, DepthNoise()).find(view)
     assert not len(truth.visible_keys)
@@ -118,7 +118,7 @@ def test_nothing_unknown_nothing_visible() -> None:
 
 
 @pytest.mark.parametrize("reach", [0, 1, 2])
-def test_nearness_is_what_its_slow_twin_says(reach: int) -> None:
+def test_nearness_equals_the_twin(reach: int) -> None:
     rng = np.random.default_rng(reach)
     keys = rng.choice(LATTICE.cell_count, 200, replace=False).astype(np.uint32)
     others = rng.choice(LATTICE.cell_count, 40, replace=False).astype(np.uint32)
@@ -139,7 +139,7 @@ def test_voxels_of_measured_people_are_not_false_and_their_visible_ones_not_miss
     frame = camera.capture(3.0)
     truth = TruthFinder(camera.intrinsics, camera.T_world_camera, lattice, camera.noise).find(frame.view)
     assert len(truth.visible_keys) > 50
-    # What the camera measured of the person, with all faults but those at the rim.
+    # The camera's measurement of the person, with all faults except those at the rim.
     z_m = frame.depth * camera.intrinsics.depth_scale_m
     on_person = (frame.owner == Owner.PERSON) & (np.abs(z_m - frame.true_z_m) < 0.1) & (frame.depth > 0)
     indices = lattice.index(apply(camera.T_world_camera, camera.intrinsics.deproject(frame.depth))[on_person])

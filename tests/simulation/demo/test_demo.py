@@ -13,7 +13,7 @@ from simulation.fleet.processes import STOP_SIGNALS
 
 @pytest.fixture(autouse=True)
 def own_signals(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The demo owns its process; here it is a guest."""
+    """Restore the signal handlers: the demo owns its process, the tests do not."""
     monkeypatch.delenv("MAKELEVEL", raising=False)
     before = [(number, signal.getsignal(number)) for number in STOP_SIGNALS]
     yield
@@ -33,7 +33,7 @@ def own_signals(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         (("--fps", "many"), "--fps: invalid number value: 'many'"),
     ],
 )
-def test_wrong_options_are_refused_in_words(
+def test_wrong_options_are_refused_with_a_message(
     arguments: tuple[str, ...], sentence: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as refused:
@@ -42,7 +42,7 @@ def test_wrong_options_are_refused_in_words(
     assert sentence in capsys.readouterr().err
 
 
-def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_with_files_is_not_changed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "precious").touch()
     assert demo.main(("--folder", str(tmp_path))) == 1
     assert f"--folder {tmp_path}: expected an empty folder" in capsys.readouterr().out

@@ -14,14 +14,14 @@ from simulation.world.world import World
 
 
 def share_like(image: NDArray[np.uint8], blue: int, green: int, red: int) -> float:
-    """Share of the pixels of about this hue: its strongest and its weakest colour are the same, and far apart."""
+    """Return the share of pixels of about this hue: equal strongest and weakest colours, far apart."""
     wanted = np.array((blue, green, red))
     strong, weak = wanted.argmax(), wanted.argmin()
     difference = image[..., strong].astype(int) - image[..., weak]
     return float(((difference > 60) & (image.argmax(axis=-1) == strong) & (image.argmin(axis=-1) == weak)).mean())
 
 
-def test_both_halves_show_the_robot_and_who_is_unknown(tmp_path: Path) -> None:
+def test_both_halves_show_the_robot_and_the_person(tmp_path: Path) -> None:
     path = tmp_path / "pictures" / "demo.png"
     assert picture.main([str(path)]) == 0
     assert path.stat().st_size <= picture.BYTES_MAX
@@ -47,6 +47,6 @@ def test_a_cube_for_each_voxel() -> None:
     assert mesh.vertices[:8].min(axis=0).tolist() == [1.0, 0.0, -1.0]
     assert mesh.vertices[8:].max(axis=0).tolist() == [3.0, 1.5, 0.0]
     corners = mesh.vertices[mesh.faces].astype(np.float64)
-    # The sum of the tetrahedra below the faces: positive when these look outwards.
+    # The sum of the tetrahedra below the faces is positive if the faces point outwards.
     volume = np.linalg.det(corners).sum() / 6.0
     assert volume == pytest.approx(2 * 0.5**3)

@@ -40,7 +40,7 @@ def test_a_terminal_is_drawn_in_place() -> None:
     assert terminal.getvalue() == f"{first}\x1b[{first.count(chr(10))}A\r{CLEAR_BELOW}{first}"
 
 
-def test_what_is_said_stands_above_the_table_until_the_end() -> None:
+def test_printed_lines_stay_above_the_table_until_the_end() -> None:
     terminal = Terminal()
     screen = Screen(terminal)
     screen.show(UNITS, MERGED, 0)
@@ -53,7 +53,7 @@ def test_what_is_said_stands_above_the_table_until_the_end() -> None:
     assert terminal.getvalue() == f"{before}bye\n"
 
 
-def test_elsewhere_a_line_now_and_then() -> None:
+def test_without_a_terminal_lines_are_periodic() -> None:
     log = io.StringIO()
     screen = Screen(log)
     for tenth in range(round(20 * LINE_EVERY_S)):

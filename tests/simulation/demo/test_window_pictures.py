@@ -11,7 +11,7 @@ from simulation.demo import window_pictures
 
 
 def frames(count: int) -> list[Image.Image]:
-    """A red square that moves over white."""
+    """Return frames of a red square that moves over white."""
     found = []
     for number in range(count):
         frame = Image.new("RGB", (window_pictures.WIDTH, window_pictures.HEIGHT), "white")
@@ -30,13 +30,13 @@ def test_frames_become_a_moving_picture(tmp_path: Path) -> None:
             assert image.convert("RGB").getpixel((round((100 * number + 150) * 0.5625), 140)) == (255, 0, 0)
 
 
-def test_a_picture_that_is_too_large_is_not_kept(tmp_path: Path) -> None:
+def test_a_picture_that_is_too_large_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="expected at most 10 bytes, got"):
         window_pictures._keep(tmp_path / "viewer.png", window_pictures._png(frames(1)[0]), 10)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_a_browser_it_says_what_installs_one(
+def test_a_missing_browser_is_named_with_the_remedy(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))

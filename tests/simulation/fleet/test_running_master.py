@@ -11,8 +11,6 @@ from simulation.fleet.processes import ChildNotReady, Processes, until_written
 from simulation.fleet.running_master import start_master
 from simulation.world.world import DEMO_CELL
 
-pytestmark = pytest.mark.alone
-
 LONG_S = 60.0
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""People walk where they should, without jumps."""
+"""People stay on their paths and move without jumps."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_a_loop_is_closed_and_walked_at_unit_speed() -> None:
     assert np.abs(turned).max() < 0.01
 
 
-def test_the_motion_is_smooth_and_ends_where_it_began() -> None:
+def test_the_motion_is_smooth_and_periodic() -> None:
     person = Person(LOOP, speed_m_s=0.9, dwell_s=3.0)
     times = np.linspace(0.0, person.lap_s, 3001)
     arcs, vigour, reach = np.array([person.motion(t) for t in times[:-1]]).T
@@ -58,12 +58,12 @@ def test_people_stay_in_the_box_on_the_floor_and_never_jump(seed: int) -> None:
         assert (high < world.cell.box_max_m).all()
         assert low[2] == pytest.approx(-0.75, abs=1e-9)
         if before is not None:
-            # The fastest is a foot that swings forward about a bend; a jump would be many times this.
+            # The fastest point is a foot that swings forward in a bend; a jump would be many times faster.
             assert np.linalg.norm(ends - before, axis=-1).max() < 5.0 * step_s
         before = ends
 
 
-def test_a_person_is_as_tall_as_told_and_keeps_the_length_of_the_limbs() -> None:
+def test_a_person_has_the_given_stature_and_rigid_limbs() -> None:
     lengths = []
     for t_s in np.arange(0.0, 12.0, 0.1):
         capsules = Person(LOOP, stature_m=1.8).capsules(t_s)
@@ -76,7 +76,7 @@ def test_a_person_is_as_tall_as_told_and_keeps_the_length_of_the_limbs() -> None
     assert tallest == pytest.approx(1.8, abs=0.06)
 
 
-def test_a_person_reaches_over_the_table_with_the_hand_that_was_told() -> None:
+def test_a_person_reaches_over_the_table_with_the_given_hand() -> None:
     for person, side in zip(demo_people(2), (1.0, -1.0), strict=True):
         middle_of_dwell_s = -person.start_s - 0.5 * person.dwell_s
         capsules = person.capsules(middle_of_dwell_s)
@@ -87,7 +87,7 @@ def test_a_person_reaches_over_the_table_with_the_hand_that_was_told() -> None:
         assert math.isclose(person.motion(middle_of_dwell_s)[2], 1.0)
 
 
-def test_the_seed_decides_and_too_many_people_are_refused() -> None:
+def test_the_seed_determines_people_and_too_many_are_refused() -> None:
     assert demo_people(2, 3) == demo_people(2, 3)
     assert demo_people(2, 3) != demo_people(2, 4)
     assert demo_people(1, 3) == demo_people(2, 3)[:1]

@@ -17,7 +17,7 @@ def world() -> World:
     return World.demo(people=0)
 
 
-def test_velocities_are_the_slope_of_the_positions() -> None:
+def test_velocities_are_the_derivative_of_the_positions() -> None:
     path, step_s = RobotPath.demo(), 1e-6
     for t_s in (0.0, 1.234, 5.9, 1000.5):
         slope = (path.joints_at(t_s + step_s) - path.joints_at(t_s - step_s)) / (2.0 * step_s)
@@ -30,14 +30,14 @@ def test_it_repeats_after_its_period() -> None:
     np.testing.assert_allclose(path.joints_at(0.7), path.joints_at(0.7 + 3 * path.period_s), atol=1e-9)
 
 
-def test_a_still_robot_stands() -> None:
+def test_a_robot_at_rest_does_not_move() -> None:
     path = RobotPath.still((0.1, 0.2, 0.3))
     np.testing.assert_array_equal(path.joints_at(3.7), (0.1, 0.2, 0.3))
     np.testing.assert_array_equal(path.velocities_at(3.7), np.zeros(3))
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan")])
-def test_a_speed_of_nothing_is_refused(speed: float) -> None:
+def test_a_speed_that_is_not_positive_is_refused(speed: float) -> None:
     with pytest.raises(InputError, match="speed"):
         RobotPath.demo(speed)
 
@@ -62,8 +62,8 @@ def test_the_robot_stays_above_the_table_out_of_the_tray_and_below_a_metre_a_sec
     assert 0.6 < speed_m_s.max() < 1.0
 
 
-def test_a_shuttle_goes_to_and_fro_at_trapezoidal_speed() -> None:
-    """The second joint's way is too short for full speed, the third has none."""
+def test_a_shuttle_moves_with_a_trapezoidal_speed_profile() -> None:
+    """The second joint's range is too short for full speed, the third has none."""
     path = ShuttlePath(np.array((1.0, 0.0, 0.3)), np.array((0.5, 0.02, 0.0)), np.array((2.0, 2.0, 2.0)), 15.0)
     times_s, step_s = np.arange(0.0, 5.0, 0.001), 1e-7
     joints = np.array([path.joints_at(t_s) for t_s in times_s])

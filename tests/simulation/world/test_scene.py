@@ -21,7 +21,7 @@ def test_a_capsule_mesh_is_closed_and_its_corners_lie_on_the_capsule(length_m: f
     np.testing.assert_allclose((low[2], high[2]), (-radius_m, length_m + radius_m), atol=1e-6)
 
 
-def test_a_capsule_becomes_a_body_that_reaches_from_end_to_end() -> None:
+def test_the_body_of_a_capsule_reaches_from_end_to_end() -> None:
     capsules = Capsules(
         np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]),
         np.array([[0.3, 0.4, 0.0], [1.0, 2.0, 3.0]]),

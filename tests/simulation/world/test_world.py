@@ -26,7 +26,7 @@ def names(world: World, t_s: float) -> set[str]:
     return {body.name for body in world.scene(t_s).bodies()}
 
 
-def test_equal_worlds_agree_without_talking(cell: Cell) -> None:
+def test_equal_worlds_give_equal_scenes(cell: Cell) -> None:
     first, second = (World.demo(people=2, seed=5, cell=cell) for _ in range(2))
     second.scene(99.0)
     for ours, theirs in zip(first.scene(12.3).bodies(), second.scene(12.3).bodies(), strict=True):
@@ -34,7 +34,7 @@ def test_equal_worlds_agree_without_talking(cell: Cell) -> None:
         np.testing.assert_array_equal(ours.T_world_mesh, theirs.T_world_mesh)
 
 
-def test_whose_everything_is(cell: Cell) -> None:
+def test_owners_of_all_bodies(cell: Cell) -> None:
     owners = {body.name: body.owner for body in World.demo(people=1, cell=cell).scene(0.0).bodies()}
     assert owners["table"] == Owner.STATIC
     assert owners["tray"] == Owner.OBJECT
@@ -52,7 +52,7 @@ def test_the_fixed_part_is_the_same_tuple_until_something_leaves(cell: Cell) -> 
     assert names(world, 5.0) == names(world, 0.0) - {"shelf"}
 
 
-def test_things_come_drift_and_go(cell: Cell) -> None:
+def test_unknown_objects_appear_drift_and_disappear(cell: Cell) -> None:
     thing = Thing("part", BOX, from_xyz_rpy((1.0, 0.0, 0.5), (0.0, 0.0, 0.3)), 1.0, 3.0, (0.0, 0.1, 0.0))
     world = World(cell, RobotPath.demo()).with_things(thing)
     assert "part" not in names(world, 0.9)
@@ -70,7 +70,7 @@ def test_a_cell_without_a_robot_has_no_joints() -> None:
     assert names(world, 1.0) == {"part"}
 
 
-def test_contradictions_are_refused(cell: Cell) -> None:
+def test_inconsistent_worlds_are_refused(cell: Cell) -> None:
     with pytest.raises(InputError, match="expected a path for its robot"):
         World(cell)
     with pytest.raises(InputError, match="expected 6 joints of cell demo, got 3"):

@@ -14,8 +14,6 @@ from edge_unit.sources.realsense import capture_link as link
 from edge_unit.sources.realsense.capture_session import CaptureSession
 from shared.errors import SourceError
 
-pytestmark = pytest.mark.alone
-
 MESSAGES = [
     link.Request(stream="color", serial="1", recording="a b.db3", resume_after=7, lockstep=True),
     link.Survey(),

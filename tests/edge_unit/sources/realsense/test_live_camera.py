@@ -12,8 +12,6 @@ import pytest
 
 from tests.edge_unit.sources.realsense import recordings
 
-pytestmark = pytest.mark.alone
-
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory: pytest.TempPathFactory) -> Any:

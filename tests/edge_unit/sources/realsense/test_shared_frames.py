@@ -14,8 +14,6 @@ import pytest
 
 from edge_unit.sources.realsense.shared_frames import SLOTS, SharedFrames
 
-pytestmark = pytest.mark.alone
-
 SHAPE = (6, 8)
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from benchmarks.reporting.report import RESULTS, Mark, Result, line, write
 from benchmarks.sweeps import runner
-from edge_unit.monitoring import Stance
+from edge_unit.monitoring import PoseMonitor
 from edge_unit.monitoring.pose_monitor import BASELINE_LOOKS_MAX, PERIOD_S, WINDOW
 from edge_unit.pipeline import DepthPipeline
 from shared.camera import Intrinsics
@@ -72,7 +72,7 @@ class WatchedCamera:
         self.intrinsics = intrinsics
         self.number = number
         self.pipeline = DepthPipeline(intrinsics, self.pose, self.world.cell)
-        self.stance = Stance(folder)
+        self.stance = PoseMonitor(folder)
         self.stance.begin("here")
         self.t_s = 0.0
 

@@ -25,8 +25,7 @@ from benchmarks.joint_delivery import Delivered, Delivery
 from benchmarks.reporting.report import RESULTS, Mark, Result, line, write
 from benchmarks.sweep_scenes.stage import reported_at
 from benchmarks.sweeps import runner
-from edge_unit.joints import DelayEstimate, DelayLook, JointEstimate, estimate_delay
-from edge_unit.joints import look_at as look_at_frame
+from edge_unit.joints import DelayComparison, DelayEstimate, JointEstimate, compare_frame, estimate_delay
 from edge_unit.joints.delay_monitor import LOOKS_MAX
 from edge_unit.pipeline import DepthPipeline, Voxels
 from shared.camera import Intrinsics
@@ -286,12 +285,12 @@ def find_delays(name: str, at_corner: bool, looks: int, intrinsics: Intrinsics) 
     settings = Settings()
     static_m = DepthPipeline(intrinsics, pose, world.cell, settings).expected_depth(None)
     assert world.cell.robot is not None
-    look = DelayLook(intrinsics, pose, world.cell.robot, static_m, settings)
+    look = DelayComparison(intrinsics, pose, world.cell.robot, static_m, settings)
     frames = [(camera.capture(number * FRAME_SPACING_S).depth, number * FRAME_SPACING_S) for number in range(looks)]
     found = []
     for delay_s in DELAYS_S:
         late = partial(_late, path, delay_s)
-        misfits = [each for depth, t_s in frames if (each := look_at_frame(look, depth, t_s, late)) is not None]
+        misfits = [each for depth, t_s in frames if (each := compare_frame(look, depth, t_s, late)) is not None]
         found.append(DelayFound(name, "at a corner" if at_corner else "near", delay_s, estimate_delay(misfits)))
     return found
 

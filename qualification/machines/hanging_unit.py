@@ -11,18 +11,18 @@ import threading
 from pathlib import Path
 
 from edge_unit import __main__
-from edge_unit.daemon.frame_processor import FrameWork
+from edge_unit.daemon.frame_processor import FrameProcessor
 from edge_unit.uplink.assignment import Report
 
 HANG = Path("/run/hang")
 
 CHECK_S = 0.1
 
-process = FrameWork.process
+process = FrameProcessor.process
 
 
-def hanging(self: FrameWork, *arguments: object) -> Report:
-    """Run `FrameWork.process` some time after `HANG` is gone."""
+def hanging(self: FrameProcessor, *arguments: object) -> Report:
+    """Run `FrameProcessor.process` some time after `HANG` is gone."""
     never = threading.Event()
     while HANG.exists():
         never.wait(CHECK_S)
@@ -30,5 +30,5 @@ def hanging(self: FrameWork, *arguments: object) -> Report:
 
 
 if __name__ == "__main__":
-    FrameWork.process = hanging  # type: ignore[method-assign, assignment]  # that is the fault
+    FrameProcessor.process = hanging  # type: ignore[method-assign, assignment]  # that is the fault
     sys.exit(__main__.main(["run", "/etc/cellwatch/unit.yaml"]))

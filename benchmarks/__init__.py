@@ -1,29 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What Cellwatch is worth, in figures: each command is one module here, its helpers are in the folder listed before it.
+"""Benchmarks of Cellwatch: each command is one module here; its helpers are in the folder listed before it.
 
-Each prints its tables and leaves them as JSON in `out/results/`; `REPORT.md` shows those of `baseline/`.
-
+Each command prints its tables and writes them as JSON to `out/results/`. `REPORT.md` shows the results of `baseline/`.
 In the order of the flow:
 
-    reporting/         figures for people and machines, and all of them as one page
-    sweep_scenes/      what `make sweeps` puts before simulated cameras
-    sweeps             all of it, as one table
-    pose_monitor       how soon a knocked camera is told, and how often one that hangs still is suspected
-    joint_delivery     a robot's joints as they reach the master: late, jittering, some lost
-    right_time         the robot filtered where it was when the frame was taken
-    board              how well a camera's pose is found by a calibration board
-    real_frames        the real recordings, and what must come out of them
-    real               a real master and a real unit on them, judged frame by frame
-    ground_truth/      what `make bench-accuracy` judges, and by which truth
-    accuracy           all of it, as one run
-    peers/             what `make bench-pipeline` races on, and against whom
-    pipeline           what a frame costs, in turns with them
-    load_generator/    who sends to a master and who reads from it
-    master             what one master bears
-    scale              one master and more and more units, until it bends
-    latency_probe/     what `make bench-latency` follows from camera to robot
-    latency            where the milliseconds go from a frame's capture to a robot's map
-    paper_experiment/  the rooms of the paper's experiment, `make bench-paper`
+    reporting/         tables and marks, JSON results, and the page of all results
+    sweep_scenes/      the scenes of `make sweeps`
+    sweeps             all sweeps, as one table
+    pose_monitor       time until a knocked camera is reported, and rate of false alarms
+    joint_delivery     simulated delivery of joints to the master: late, jittering, some lost
+    right_time         robot filtering with late, jittering or rare joints
+    board              error of a camera pose from a calibration board
+    real_frames        the real recordings, and their ground truth
+    real               a real master and a real unit on the recordings, judged frame by frame
+    ground_truth/      scenes, rules and judges of `make bench-accuracy`
+    accuracy           all trials, as one run
+    peers/             peers and scene of `make bench-pipeline`
+    pipeline           cost of a frame, in turns with the peers
+    load_generator/    simulated senders and readers of a master
+    master             load test of one master
+    scale              one master with an increasing number of units, up to its limit
+    latency_probe/     cameras and units of `make bench-latency`
+    latency            time from a frame's capture to the map at a robot, by stage
+    paper_experiment/  parts of `make bench-paper`
     paper              the paper's experiment, in one command
-    bench              those that fit into twenty minutes, and the page
+    bench              the parts that fit into twenty minutes, and the page
 """

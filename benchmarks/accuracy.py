@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make bench-accuracy`: how much of what stands before a camera is found, how much that does not, and how far off.
+"""`make bench-accuracy`: count the obstacle voxels that the filter finds, misses and invents, and measure their
+distance error.
 
-Ours, the paper's own rule and a least number of points a voxel, on the same frames of a D435i whose every pixel is a
-ray cast by Embree, as curves over distance, size, voxels and thresholds; then on real frames. Prints tables, and leaves
-all of it in `out/results/accuracy.json`: its `curves` explain themselves, its `remarks` say where ours is the worse.
-Exits with 1 when a mark is missed.
+Our filter, the paper's own rule and a minimum number of points per voxel get the same frames of a D435i. Embree casts a
+ray for each pixel. The results are curves over distance, size, voxel size and threshold; then follow real frames. The
+command prints tables and writes `out/results/accuracy.json`. Its `curves` explain themselves, and its `remarks` list
+the figures in which our filter is worse. The exit code is 1 when a mark is missed.
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ REAL = "real"
 PARTS = (*TRIALS, REAL)
 
 MARKED_FROM_M, MARKED_TO_M = 0.75, 3.0
-"""Where the things must be found: nearer a person does not fit into the picture, farther noise is 60 mm and more."""
+"""Distances between which the things must be found. A nearer person does not fit into the image; beyond it, the noise
+is 60 mm or more.
+"""
 
 FOUND_MIN_PERCENT, FALSE_FRAMES_MAX = 99.0, 0.5
 
@@ -68,10 +71,11 @@ SHOWN = {
 """The columns of each axis's table."""
 
 REMARKS = (
-    "All contenders get the same frames, the same picture of what is known (the pipeline's expected depth) and the "
-    "same mask of the padded robot: rules are compared, not renderers.",
-    "The noise model is a D435i's as measured on recorded frames, with halo, shadow, flying pixels and holes; it never "
-    "loses a thin thing as a real stereo matcher may, and has no wrong matches but those of the curves that name them.",
+    "All contenders get the same frames, the same expected depth of the pipeline and the same mask "
+    "of the padded robot: the benchmark compares rules, not renderers.",
+    "The noise model is a D435i's as measured on recorded frames, with halo, shadow, flying pixels "
+    "and holes. It never loses a thin thing, as a real stereo matcher may. Only the curves that name"
+    " them have wrong matches.",
 )
 
 PICTURES = (
@@ -88,7 +92,7 @@ PICTURES = (
     ("limit", "false_per_1000", ARM),
     ("wall", "false_per_1000", WALL),
 )
-"""Of the curves those that the page shows: axis, metric, subject."""
+"""Curves that the page shows: axis, metric, subject."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -128,9 +132,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(
     parts: Sequence[str], amount: Amount, settings: FilterSettings, processes: int
 ) -> tuple[Collection, list[Judged]]:
-    """All trials of the `parts`, and the real frames when they are among them."""
+    """Run all trials of the `parts`, and the real frames if `parts` names them."""
     trials: list[AnyTrial] = []
-    # Long ones first, so that no process works alone in the end.
+    # The longest trials run first, so that no process works alone at the end.
     for part in sorted(parts, key=lambda part: part != "size"):
         if part != REAL:
             trials += TRIALS[part](amount, settings)
@@ -150,7 +154,7 @@ def run(
 
 
 def marks_of(collection: Collection, amount: Amount, parts: Sequence[str]) -> list[Mark]:
-    """What our filter is held against on the stage."""
+    """Return the marks of our filter on the stage."""
     marks = []
     if "distance" in parts:
         held = [each for each in amount.distances_m if MARKED_FROM_M <= each <= MARKED_TO_M]
@@ -176,7 +180,7 @@ def marks_of(collection: Collection, amount: Amount, parts: Sequence[str]) -> li
 
 
 def document_of(curves: list[Curve], amount: Amount, settings: FilterSettings) -> dict[str, Any]:
-    """What was measured and how, as plain values; `curves` are for pictures, `figures` are all of them."""
+    """Return the measured figures and the method as plain values. `curves` are for plots; `figures` has all of them."""
     shown = {(curve.axis.key, curve.metric.key, curve.subject): curve for curve in curves}
     pictures = [shown[name].picture for name in PICTURES if name in shown]
     if any(curve.axis.key == "distance" for curve in curves):
@@ -222,11 +226,11 @@ def _print(curves: list[Curve]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="make bench-accuracy", description="The filter against ground truth.")
-    parser.add_argument("--quick", action="store_true", help="little of everything, in some seconds")
-    parser.add_argument("--only", nargs="+", choices=PARTS, help="not all of the parts")
-    parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 8), help="how many work at a time")
-    parser.add_argument("--results", type=Path, help="folder for accuracy.json, also of a run that is not whole")
+    parser = argparse.ArgumentParser(prog="make bench-accuracy", description="Compare the filter with ground truth.")
+    parser.add_argument("--quick", action="store_true", help="a small amount of everything, in some seconds")
+    parser.add_argument("--only", nargs="+", choices=PARTS, help="only these parts")
+    parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 8), help="number of processes")
+    parser.add_argument("--results", type=Path, help="folder for accuracy.json, also of a partial run")
     return parser
 
 

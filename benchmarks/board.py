@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make bench-board`: how well a camera's pose is found by a calibration board, by kind of board, stream and distance.
+"""`make bench-board`: measure the error of a camera pose from a calibration board, by kind of board, stream and
+distance.
 
-Simulated pictures of 1280x720: perspective, antialiased, blur of 0.6 px, noise of 2 grey values in 255. Boards are
-tilted by 10 to 45 degrees and stand anywhere in the middle third of the picture. The frames of a view differ by their
-noise only. Prints a table, and all of it as one line of JSON; a whole run leaves that in `out/results/board.json`.
-Exits with 1 when a mark is missed.
+The images are simulated: 1280x720, perspective, antialiased, blur of 0.6 px, noise of 2 grey values in 255. Boards are
+tilted by 10 to 45 degrees and stand anywhere in the middle third of the image. The frames of one view differ only in
+their noise. The command prints a table and all figures as one line of JSON; a whole run also writes
+`out/results/board.json`. The exit code is 1 when a mark is missed.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from shared.transforms import angle_rad, from_rotation_translation, identity, in
 from simulation.cameras.board_picture import BoardPicture
 
 FRAMES = 10
-"""Of a view: what a unit takes before it is content."""
+"""Frames of one view: the number that a unit takes for a calibration."""
 
 VIEWS = 50
 
@@ -40,7 +41,7 @@ DISTANCES_M = (1.0, 2.0, 3.0)
 TILTS_DEG = (10.0, 45.0)
 
 MARKED = {1.0: (3.0, 0.2), 3.0: (15.0, 0.3)}
-"""By distance: mm and degrees that 90 of 100 views must be within."""
+"""By distance in metres: the error in mm and degrees that 90 of 100 views must not exceed."""
 
 STREAMS = {
     "colour": Intrinsics(1280, 720, 915.0, 915.0, 641.25, 361.75),
@@ -58,12 +59,12 @@ BOARDS = {
     "colour": (_board("grid", 5, 7, 75.0, 60.0), _board("charuco", 5, 7, 75.0, 56.0)),
     "infrared": (_board("grid", 3, 4, 125.0, 100.0), _board("charuco", 4, 5, 130.0, 100.0)),
 }
-"""Fewer pixels a degree need larger markers: 60 mm for colour, 100 mm for infrared."""
+"""A stream with fewer pixels per degree needs larger markers: 60 mm for colour, 100 mm for infrared."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What came of one view; NaN where no pose was found."""
+    """Result of one view; NaN if no pose was found."""
 
     error_mm: float
     error_deg: float
@@ -118,12 +119,12 @@ def views(stream: str, board: Board, distance_m: float, count: int, first: int =
 
 
 def result(found: dict[tuple[str, Board, float], list[View]]) -> Result:
-    """One row a board, stream and distance; marks where there are any."""
+    """Return one row per board, stream and distance, and the marks of those distances that have one."""
     rows: list[tuple[str | float, ...]] = []
     marks = []
     for (stream, board, distance_m), each in found.items():
         name = f"{board.kind} {1e3 * board.marker_m:.0f} mm"
-        # A view without a pose is worse than any error.
+        # A view without a pose counts as worse than any error.
         error_mm = np.nan_to_num([view.error_mm for view in each], nan=np.inf)
         error_deg = np.nan_to_num([view.error_deg for view in each], nan=np.inf)
         posed = [view for view in each if np.isfinite(view.error_mm)]
@@ -151,7 +152,7 @@ def result(found: dict[tuple[str, Board, float], list[View]]) -> Result:
 
 
 def _nearest(values: Sequence[float] | NDArray[np.float64], percent: float) -> float:
-    """A percentile that is one of the values, for some may be infinite."""
+    """Return a percentile that is one of the values, because some values may be infinite."""
     return float(np.percentile(values, percent, method="higher"))
 
 
@@ -161,9 +162,11 @@ def _median(values: Sequence[float]) -> float:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure all boards."""
-    parser = argparse.ArgumentParser(prog="make bench-board", description="The camera's pose by a calibration board.")
-    parser.add_argument("--views", type=int, default=VIEWS, help=f"of each board at each distance ({VIEWS})")
-    parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 8), help="how many work at a time")
+    parser = argparse.ArgumentParser(
+        prog="make bench-board", description="Measure the camera pose from a calibration board."
+    )
+    parser.add_argument("--views", type=int, default=VIEWS, help=f"views of each board at each distance ({VIEWS})")
+    parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 8), help="number of processes")
     parser.add_argument("--results", type=Path, help="folder for board.json, also of a run with fewer views")
     options = parser.parse_args(arguments)
     cases = [

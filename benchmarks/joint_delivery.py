@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot's joint samples as they reach the master: late, jittering, some lost, with or without their times."""
+"""Simulated delivery of a robot's joint samples to the master: late, jittering, some lost, with or without times."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from shared.messages import JointsRequest
 from simulation.world.robot_path import JointPath
 
 EPOCH_NS = NS_PER_S
-"""The master's clock at the path's time 0."""
+"""Time of the master's clock at time 0 of the path."""
 
 SPACING_S = 1e-4
-"""Messages of one connection come one after the other, a late one holding up those behind it."""
+"""Minimum time between two messages of one connection. A late message holds up those behind it."""
 
 CLOCK_UNCERTAINTY_NS = NS_PER_S // 1000
-"""Half a round trip in a busy network."""
+"""Uncertainty of the clock offset: half a round trip in a busy network."""
 
 
 @dataclass(frozen=True)
 class Delivery:
-    """How samples come: `delay_s` and, on average, `jitter_s` (exponential) late; `lost_share` of them never.
+    """Delivery of samples: late by `delay_s` plus a mean of `jitter_s` (exponential); `lost_share` of them are lost.
 
-    Without `stamped` they carry no time and count from their arrival. The unit is told `told_delay_s`.
+    Without `stamped` samples carry no time, and the time of arrival counts. The unit corrects by `configured_delay_s`.
     """
 
     name: str
@@ -38,15 +38,15 @@ class Delivery:
     lost_share: float = 0.0
     stamped: bool = True
     velocities: bool = True
-    told_delay_s: float = 0.0
+    configured_delay_s: float = 0.0
 
 
 class Delivered:
-    """A master and a unit that are told of a path by a delivery; to be asked in the order of time."""
+    """A master and a unit that receive a path through a delivery. Query them in the order of time."""
 
     def __init__(self, delivery: Delivery, path: JointPath, seconds: float, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
-        # From before the path's begin, so that the first frame finds the robot under way.
+        # Samples start before the path does, so that the robot already moves in the first frame.
         at_s = np.arange(-0.5, seconds + 0.5, 1.0 / delivery.rate_hz)
         late_s = delivery.delay_s + rng.exponential(delivery.jitter_s, len(at_s)) * (delivery.jitter_s > 0.0)
         kept = rng.random(len(at_s)) >= delivery.lost_share
@@ -60,10 +60,10 @@ class Delivered:
         self._master = RobotJoints(tuple(f"joint_{i}" for i in range(len(joints))))
         self._unit = JointHistory()
 
-    def joints_at(self, captured_s: float, asked_s: float, stale_after_s: float) -> JointEstimate | None:
-        """What the unit knows at `asked_s` of where the robot was at `captured_s`."""
+    def joints_at(self, captured_s: float, queried_s: float, stale_after_s: float) -> JointEstimate | None:
+        """Return the unit's estimate, at `queried_s`, of the joints at `captured_s`."""
         delivery = self._delivery
-        while self._coming and self._coming[0][0] <= asked_s:
+        while self._coming and self._coming[0][0] <= queried_s:
             arrives_s, at_s = self._coming.popleft()
             self._master.put(
                 JointsRequest(
@@ -74,7 +74,7 @@ class Delivered:
                 _ns(arrives_s),
             )
         self._unit.add(self._master.since(self._unit.newest_ns))
-        return self._unit.at(_ns(captured_s + delivery.told_delay_s), CLOCK_UNCERTAINTY_NS, stale_after_s)
+        return self._unit.at(_ns(captured_s + delivery.configured_delay_s), CLOCK_UNCERTAINTY_NS, stale_after_s)
 
 
 def _ns(t_s: float) -> int:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make bench-latency`: where the milliseconds go from the capture of a frame to the map that a robot has.
+"""`make bench-latency`: measure the time from the capture of a frame to the map at a robot, stage by stage.
 
-Four real units, a master, the robot's controller and two robots that read the map, all on this machine, whose
-processes share one clock. Cameras play frames that were rendered before (`timing.frames`): neither a renderer nor a
-disk takes time from what is measured; what a real camera takes to expose and to transfer is not in it either. Prints
-the tables, and at the end all of it as one line of JSON; exits with 1 when a mark is missed.
+Four real units, a master, the robot's controller and two robots that read the map run on this machine and share one
+clock. The cameras play frames that were rendered beforehand (`benchmarks.latency_probe.frames`), so neither a renderer
+nor a disk takes time from the measurement. The exposure and transfer of a real camera are not included. The command
+prints the tables and, at the end, all figures as one line of JSON. The exit code is 1 when a mark is missed.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ SIZES = ((424, 240), (848, 480))
 RATES_HZ = (15.0, 30.0)
 SECONDS, SETTLE_S = 8.0, 2.0
 
-ASK_S = 0.02
-"""A planner that asks 50 times a second."""
+POLL_S = 0.02
+"""Period of a planner that polls 50 times a second."""
 
 START_S = 60.0
-"""For all units to be live on a busy machine."""
+"""Time limit for all units to be live on a busy machine."""
 
 POLL_S = 0.05
 
 FULL_HZ = 30.0
 P99_MS_MAX = 1000.0 / FULL_HZ
-"""A frame is at the robot before the next is taken."""
+"""A frame must be at the robot before the next one is taken."""
 
 TAIL_S = 0.5
-"""Of the end of each run: frames that could not be read any more do not count."""
+"""Time at the end of each run that does not count: readers may not have received its frames."""
 
 STAGES: Mapping[str, str] = {
     "source": "the frame comes to the unit (here: a timer)",
@@ -95,7 +95,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Timed:
-    """What a case came to: milliseconds of each frame by stage, and how many frames came to nothing."""
+    """Figures of one case: milliseconds of each frame by stage, and the number of frames that were lost."""
 
     case: Case
     ms: dict[str, NDArray[np.float64]]
@@ -104,7 +104,7 @@ class Timed:
 
 
 def timed(case: Case, records: Sequence[TraceRecord], readings: Mapping[str, Sequence[Reading]]) -> Timed:
-    """Put together what the units traced of their frames, and what the robots noted of their maps."""
+    """Combine the units' traces of their frames with the robots' records of their maps."""
     sent = [record for record in records if record.sent and record.stages_ns]
     rows = [_stages_ns(record) for record in sent]
     ms: dict[str, NDArray[np.float64]] = {
@@ -143,17 +143,17 @@ def _stages_ns(record: TraceRecord) -> dict[str, int]:
 
 
 class Bench:
-    """Starts what one case needs, anew for each."""
+    """Starts the processes of one case, anew for each."""
 
     def __init__(self, processes: Processes, folder: Path, seconds: float) -> None:
         self._processes, self._folder, self._seconds = processes, folder, seconds
         self._count = 0
 
     async def run(self, case: Case, rings: Sequence[Path]) -> Timed:
-        """One case from the first process to the last.
+        """Run one case from the first process to the last.
 
         Raises:
-            CellwatchError: something did not start, or ended before its time.
+            CellwatchError: a process did not start, or ended too early.
         """
         self._count += 1
         folder = self._folder / str(self._count)
@@ -194,7 +194,7 @@ class Bench:
         await self._all_live(url, (master, robot, *units))
         await asyncio.sleep(SETTLE_S)
         readers = await self._start(
-            "readers", "benchmarks.load_generator.map_readers", url, operator, str(ASK_S), str(result)
+            "readers", "benchmarks.load_generator.map_readers", url, operator, str(POLL_S), str(result)
         )
         await until_written(readers, result.with_suffix(BEGUN), START_S)
         began_ns = monotonic_ns()
@@ -233,7 +233,7 @@ class Bench:
 async def measure(
     cases: Sequence[Case], rings: Mapping[tuple[int, int], Sequence[Path]], folder: Path, seconds: float
 ) -> list[Timed]:
-    """One case after the other."""
+    """Run one case after the other."""
     async with Processes(folder / "logs", without=(UNIT_PREFIX, MASTER_PREFIX)) as processes:
         bench = Bench(processes, folder, seconds)
         return [await bench.run(case, rings[case.size]) for case in cases]
@@ -254,7 +254,7 @@ def _mark(each: Timed) -> Mark:
 
 
 def result(found: Sequence[Timed]) -> Result:
-    """A row a stage, and of each case its median and p99."""
+    """Return one row per stage, with the median and p99 of each case."""
     names = [*STAGES, TO_MERGED]
     for reader, reads in READS.items():
         names += [*(f"{reader}: {name}" for name in reads), WHOLE[reader]]
@@ -271,8 +271,8 @@ def result(found: Sequence[Timed]) -> Result:
         f"Frames that were merged: {told}.",
         f"Medians and p99 do not add up. Cameras play {FRAMES} frames of the demo cell (a person, the robot in its "
         f"period of {PERIOD_S:g} s) rendered beforehand; a frame counts from the moment at which it fell due.",
-        "The stages up to the merge are what the units' own trace tells (trace_path), the master's times among them by "
-        "their estimate of its clock; what a robot has, by its own.",
+        "The stages up to the merge come from the units' own trace (trace_path), with the master's times"
+        " converted by the unit's estimate of its clock. Later stages come from the robot's clock.",
     )
     return Result(f"Where the milliseconds go: {UNITS} units, one master", columns, tuple(rows), tuple(marks), remarks)
 
@@ -333,12 +333,14 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="make bench-latency", description="From a frame's capture to a robot's map.")
+    parser = argparse.ArgumentParser(
+        prog="make bench-latency", description="Measure the time from a frame's capture to a robot's map."
+    )
     parser.add_argument("--sizes", type=_size, nargs="+", default=SIZES, metavar="WxH", help="424x240 848x480")
     parser.add_argument("--rates", type=float, nargs="+", default=RATES_HZ, choices=RATES_HZ, help="frames/s (15 30)")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help=f"of each case ({SECONDS:g})")
-    parser.add_argument("--frames", type=int, default=FRAMES, help=f"rendered of each camera ({FRAMES})")
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for latency.json")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help=f"duration of each case ({SECONDS:g})")
+    parser.add_argument("--frames", type=int, default=FRAMES, help=f"frames rendered for each camera ({FRAMES})")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="folder for latency.json")
     return parser
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one master bears: a real one on loopback, and many units at addresses of their own that post to it.
+"""Load test of one real master on loopback, with many units that post to it from addresses of their own.
 
-The master has one core of this machine to itself, and what makes the load (units, the robot's controller) another. How
-many updates it takes at most is measured in turns with a bare route of FastAPI on the same core, so that the ratio says
-something where the figure itself depends on the machine.
+The master has one core of this machine to itself. The load (units and the robot's controller) has another. The maximum
+rate of updates is measured in turns with a bare route of FastAPI on the same core. So the ratio is meaningful even
+though the rate itself depends on the machine.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ TURNS = 4
 TURN_S = 4.0
 
 MOST_UNITS, MOST_VOXELS = 50, 1000
-"""In flight at once, so that the master never waits for the load."""
+"""Connections in flight at once, so that the master never waits for the load."""
 
 P99_MS, MOST_PER_S = 6.0, 4000.0
 BYTES_A_VOXEL, BYTES_BESIDE = 4, 800
 
 
 class Bench:
-    """Starts servers and loads, each on its core."""
+    """Starts servers and loads, each on its own core."""
 
     def __init__(self, processes: Processes, folder: Path, seconds: float) -> None:
         cores = sorted(os.sched_getaffinity(0))
@@ -52,13 +52,13 @@ class Bench:
 
     @property
     def apart(self) -> bool:
-        """Whether the server has a core of its own."""
+        """Return True if the server has a core of its own."""
         return self._server_core != self._load_core
 
     async def at_rate(
         self, units: int, voxels: int, viewers: int = 0, rate_hz: float = FRAME_RATE_HZ
     ) -> dict[str, Any]:
-        """A master with so many units of so many frames a second, and so many who look at its viewer."""
+        """Load a master with so many units at so many frames per second, and with so many viewers."""
         found = await self._run(units, voxels, rate_hz, False, self._seconds, viewers)
         seen = found["bytes_seen"] / max(found["seen_reports"], 1)
         both = (found["bytes_out"] + found["bytes_in"] - found["bytes_seen"]) / max(found["counted"], 1)
@@ -74,7 +74,9 @@ class Bench:
         }
 
     async def at_most(self, bare: bool) -> tuple[float, float]:
-        """Updates of MOST_VOXELS voxels that a server takes each second, and microseconds of CPU for each of them."""
+        """Return the updates of MOST_VOXELS voxels that a server takes per second, and microseconds of CPU for each of
+        them.
+        """
         seconds = min(self._seconds, TURN_S)
         found = await self._run(MOST_UNITS, MOST_VOXELS, None, bare, seconds)
         if found["lost"] or found["map_wrong"]:
@@ -101,7 +103,7 @@ class Bench:
             if viewers:
                 children.append(await self._watchers(master, viewers))
         token_file = self._folder / "token"
-        token_file.write_text("no token is asked for here" if master is None else master.unit_token)
+        token_file.write_text("the bare route needs no token" if master is None else master.unit_token)
         plan = Plan(
             url, str(token_file), str(DEMO_CELL), units, voxels, seconds, WARM_UP_S, rate_hz, pid, bare
         )  # fmt: skip
@@ -121,7 +123,7 @@ class Bench:
         return found
 
     async def _watchers(self, master: RunningMaster, viewers: int) -> Child:
-        """So many who look at the master's viewer, once all of them see something."""
+        """Start the viewers of the master, and return once all of them have the cell."""
         seeing = self._folder / "seeing"
         seeing.unlink(missing_ok=True)
         watchers = await self._processes.start(
@@ -133,7 +135,7 @@ class Bench:
         return watchers
 
     async def _bare(self) -> tuple[Child, str, int]:
-        """The bare route, its URL and the number of its process."""
+        """Start the bare route. Return it, its URL and its process id."""
         ready_file = self._folder / "bare.json"
         ready_file.unlink(missing_ok=True)
         server = await self._processes.start(
@@ -144,7 +146,7 @@ class Bench:
 
 
 async def measure(units: Sequence[int], voxels: Sequence[int], seconds: float, turns: int) -> dict[str, Any]:
-    """All loads, then the most that master and bare route take, in turns; tables are printed on the way."""
+    """Measure all loads, then the maximum rate of master and bare route in turns. Print tables on the way."""
     with tempfile.TemporaryDirectory(prefix="cellwatch-bench-") as scratch:
         folder = Path(scratch)
         async with Processes(folder / "logs", without=(MASTER_PREFIX,)) as processes:
@@ -187,7 +189,7 @@ async def measure(units: Sequence[int], voxels: Sequence[int], seconds: float, t
 
 
 def marks_of(found: dict[str, Any]) -> list[Mark]:
-    """What is asked of a master."""
+    """Return the marks of a master."""
     loads = found["loads"]
     marks = [
         Mark("updates lost", float(sum(load["lost"] for load in loads)), at_most=0.0),
@@ -225,7 +227,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _best(turns: list[tuple[float, float]]) -> tuple[float, float]:
-    """The highest rate and the least CPU time: who else is busy on the machine only ever takes away from them."""
+    """Return the highest rate and the least CPU time, because other processes on the machine only make both worse."""
     return max(per_s for per_s, _ in turns), min(cpu_us for _, cpu_us in turns)
 
 
@@ -247,12 +249,12 @@ def _load_table(loads: list[dict[str, Any]]) -> tuple[tuple[str, ...], tuple[tup
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="make bench-master", description="What one master bears.")
-    parser.add_argument("--units", type=int, nargs="+", default=UNITS, help="loads of so many units (1 4 10 50)")
-    parser.add_argument("--voxels", type=int, nargs="+", default=VOXELS, help="in each update (100 1000)")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help=f"of each measurement ({SECONDS:g})")
-    parser.add_argument("--turns", type=int, default=TURNS, help=f"of the most that it takes ({TURNS})")
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for master.json")
+    parser = argparse.ArgumentParser(prog="make bench-master", description="Load test of one master.")
+    parser.add_argument("--units", type=int, nargs="+", default=UNITS, help="numbers of units (1 4 10 50)")
+    parser.add_argument("--voxels", type=int, nargs="+", default=VOXELS, help="voxels of each update (100 1000)")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help=f"duration of each measurement ({SECONDS:g})")
+    parser.add_argument("--turns", type=int, default=TURNS, help=f"turns of the maximum rate ({TURNS})")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="folder for master.json")
     return parser
 
 

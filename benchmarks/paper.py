@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make bench-paper`: the experiment of the paper that the method comes from, on this machine.
 
-The scene's refresh by resolution, voxel size (10 to 100 mm) and number of cameras (one to four), distributed and
-centralised, all contenders in turns on the same frames. Every map is held against what the frames must give.
+It measures the refresh of the scene by resolution, voxel size (10 to 100 mm) and number of cameras (one to four),
+distributed and centralised. All contenders take turns on the same frames. Every map is compared with the map that the
+frames must give.
 """
 
 from __future__ import annotations
@@ -38,12 +39,12 @@ from simulation.fleet.fleet import MASTER_PREFIX
 from simulation.fleet.processes import Processes
 
 VOXEL_M = 0.02
-"""Where one size stands for all."""
+"""Voxel size of the tables that have only one."""
 
 
 @dataclass(frozen=True)
 class Amount:
-    """How much of everything."""
+    """Number of frames, rounds and sizes of a run."""
 
     resolutions: tuple[tuple[int, int], ...] = ((424, 240), (640, 480), (1280, 720))
     sizes_m: tuple[float, ...] = tuple(mm / 1e3 for mm in range(10, 101, 10))
@@ -69,7 +70,7 @@ QUICK = Amount(
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """All that was measured; in what is called `same`, all cameras have the same frames."""
+    """All measurements. In the fields named `same`, all cameras have the same frames."""
 
     book: Book
     parts: list[composed.Parts]
@@ -82,9 +83,9 @@ async def measure(amount: Amount) -> Found:
     book, same = Book(), Book()
     parts: list[composed.Parts] = []
     cores = sorted(os.sched_getaffinity(0))
-    with tempfile.TemporaryDirectory(prefix="cellwatch-paper-") as scratch, _told("all of it"):
+    with tempfile.TemporaryDirectory(prefix="cellwatch-paper-") as scratch, _timed("all of it"):
         folder = Path(scratch)
-        with _told("frames rendered"):
+        with _timed("frames rendered"):
             seen = [views(*size, amount.frames) for size in amount.resolutions]
         write_cell(seen[0].cell, folder / "cell.yaml")
         async with Processes(folder / "logs", without=(MASTER_PREFIX,)) as processes:
@@ -93,16 +94,16 @@ async def measure(amount: Amount) -> Found:
             os.sched_setaffinity(0, {cores[0]})
             try:
                 for each in seen:
-                    with _told(f"{each.name}, composed and centralised"):
+                    with _timed(f"{each.name}, composed and centralised"):
                         bench = composed.Bench(site, each, UNITS_COMPOSED, book)
                         parts += await bench.run(amount.sizes_m, amount.rounds, amount.octree_rounds)
-                with _told("all cameras with the same frames"):
+                with _timed("all cameras with the same frames"):
                     bench = composed.Bench(site, seen[-1].of_one(0), UNITS_SAME_FRAMES, same)
                     (same_parts,) = await bench.run((VOXEL_M,), amount.same_rounds, {})
             finally:
                 os.sched_setaffinity(0, cores)
             site.pin(set(cores))
-            with _told("units as processes"):
+            with _timed("units as processes"):
                 await _run_units(site, seen, folder, amount, book)
     return Found(book, parts, same, same_parts)
 
@@ -115,7 +116,7 @@ async def _run_units(site: master.Site, seen: Sequence[Views], folder: Path, amo
 
 
 def results_of(found: Found) -> dict[str, Result]:
-    """The tables, by name."""
+    """Return the tables by name."""
     book, parts = found.book, found.parts
     voxel_mm = in_mm(VOXEL_M)
     largest = parts[-1].resolution
@@ -149,7 +150,7 @@ def results_of(found: Found) -> dict[str, Result]:
 
 
 def curves_of(book: Book) -> dict[str, Curves]:
-    """The pictures, by name: the largest resolution, and every contender that was measured there."""
+    """Return the plots by name: the largest resolution, and every contender that was measured there."""
     contenders, resolution = (UNITS_COMPOSED, ONE_PROCESS, ONE_OCTREE), [key.resolution for key in book][-1]
     cameras = tables.PAPER_CAMERAS
     return {
@@ -196,17 +197,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @contextmanager
-def _told(what: str) -> Iterator[None]:
-    """Say how long it took, when it is done."""
+def _timed(what: str) -> Iterator[None]:
+    """Print the duration of the block when it is done."""
     began_ns = monotonic_ns()
     yield
     print(f"{what}: {(monotonic_ns() - began_ns) / NS_PER_S:.0f} s", file=sys.stderr, flush=True)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="make bench-paper", description="The paper's experiment on this machine.")
-    parser.add_argument("--quick", action="store_true", help="little of everything, within a minute")
-    parser.add_argument("--results", type=Path, metavar="DIR", help="for paper.json, also of a quick run")
+    parser = argparse.ArgumentParser(prog="make bench-paper", description="Run the paper's experiment on this machine.")
+    parser.add_argument("--quick", action="store_true", help="a small amount of everything, within a minute")
+    parser.add_argument("--results", type=Path, metavar="DIR", help="folder for paper.json, also of a quick run")
     return parser
 
 

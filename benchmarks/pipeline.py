@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make bench-pipeline`: what a frame costs, beside Open3D, OctoMap, Embree and a memcpy on the same frames.
+"""`make bench-pipeline`: measure the cost of a frame beside Open3D, OctoMap, Embree and a memcpy on the same frames.
 
-All on one thread and in turns of a few frames, so that whatever else the machine does falls on all of them. Figures are
-medians over all frames, ratios those of medians. The first frame of a turn is told apart, too: the others have emptied
-the caches then, as the other programs of a board do between two frames of a camera.
+All contenders use one thread and take turns of a few frames, so other load on the machine affects all of them. Figures
+are medians over all frames; ratios are ratios of medians. The first frame of a turn is also listed by itself: its
+caches were filled by other contenders, as other programs of a board fill them between two frames of a camera.
 """
 
 from __future__ import annotations
@@ -36,48 +36,48 @@ FRAMES_A_TURN = 3
 TABLE_TURNS = 8
 
 ARBITRARY_RAW = (300, 2500)
-"""Each pixel of the worst frame has a depth of its own from this range: no frame touches more voxels."""
+"""Each pixel of the worst frame has a random depth of this range. No frame touches more voxels."""
 
 DUFOMAP = "DUFOMap, the same points"
 
 VOXELS = "process(), as far as the voxels"
-"""Peers tell neither what is seen nor how well a frame fits, so this is what they are raced against."""
+"""Peers compute neither seen nor health, so they are compared with this part only."""
 
 Work = Callable[[int], object]
-"""Takes the number of a frame; returns a `Part` where only that counts."""
+"""Takes the number of a frame. Returns a `Part` if only that part of the work counts."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Nanoseconds that a part of some work took."""
+    """Duration of a part of some work in nanoseconds."""
 
     took_ns: int
 
 
 class Spent:
-    """Milliseconds that the frames of one contender took, turn by turn."""
+    """Milliseconds of the frames of one contender, turn by turn."""
 
     def __init__(self) -> None:
         self.turns: list[list[float]] = []
 
     @property
     def median(self) -> float:
-        """Over all frames."""
+        """Return the median over all frames."""
         return float(np.median(self.turns))
 
     @property
     def p99(self) -> float:
-        """Over all frames."""
+        """Return the 99th percentile over all frames."""
         return float(np.percentile(self.turns, 99))
 
     @property
     def first(self) -> float:
-        """Median of the first frames of the turns: others have emptied the caches."""
+        """Return the median of the first frames of the turns. Their caches were filled by other contenders."""
         return float(np.median([turn[0] for turn in self.turns]))
 
 
 def in_turns(contenders: Mapping[str, Work], turns: int, frames: int = FRAMES) -> dict[str, Spent]:
-    """Have each of them do a few frames, then the next, and so on; the first round compiles and is not counted."""
+    """Run a few frames of each contender in turn. The first round compiles and does not count."""
     spent = {name: Spent() for name in contenders}
     for turn in range(turns + 1):
         for name, work in contenders.items():
@@ -93,7 +93,7 @@ def in_turns(contenders: Mapping[str, Work], turns: int, frames: int = FRAMES) -
 
 
 def contenders_of(frames: Recording) -> dict[str, Work]:
-    """Ours and theirs, by name; each takes the number of a frame."""
+    """Return our variants and the peers by name. Each takes the number of a frame."""
     from benchmarks.peers import contenders as peers
 
     pipeline, still = frames.pipeline(VOXEL_M), frames.pipeline(VOXEL_M)
@@ -103,7 +103,7 @@ def contenders_of(frames: Recording) -> dict[str, Work]:
     camera = peers.Camera(frames.intrinsics, frames.T_world_camera, frames.cell)
     open3d, embree = peers.Open3D(camera, pipeline.settings), peers.Embree(camera)
     octomap, discrete = peers.OctoMap(camera, VOXEL_M), peers.OctoMap(camera, VOXEL_M)
-    # It is made for fewer processors than the others.
+    # DUFOMap is built for a smaller set of processors than the others.
     dufomap = peers.DUFOMap(camera, VOXEL_M) if importlib.util.find_spec("dufomap") else None
     marked = [pipeline.foreground(depth[n], joints[n]) for n in range(len(depth))]
     points_m = [camera.points_m(depth[n], marked[n]) for n in range(len(depth))]
@@ -135,7 +135,7 @@ def contenders_of(frames: Recording) -> dict[str, Work]:
 
 
 def compare(frames: Recording, turns: int) -> tuple[dict[str, Any], list[Mark]]:
-    """What a frame costs beside its peers: figures by name, and the marks that they are held against."""
+    """Compare the cost of a frame with the peers. Return the figures by name, and their marks."""
     from benchmarks.peers.contenders import PEERS
 
     spent = in_turns(contenders_of(frames), turns, len(frames.depth))
@@ -196,7 +196,7 @@ def compare(frames: Recording, turns: int) -> tuple[dict[str, Any], list[Mark]]:
 
 
 def costs_by_size(recordings: Sequence[Recording], turns: int) -> tuple[dict[str, Any], list[Mark]]:
-    """Milliseconds from frame to voxels by resolution and voxel size, on the same frames."""
+    """Return the milliseconds from frame to voxels by resolution and voxel size, on the same frames."""
     costs: dict[str, dict[str, float]] = {}
     for frames in recordings:
         pipelines = {f"{size * 1e3:g} mm": frames.pipeline(size) for size in VOXEL_SIZES_M}
@@ -220,7 +220,7 @@ def costs_by_size(recordings: Sequence[Recording], turns: int) -> tuple[dict[str
 
 
 def _to_voxels(pipeline: DepthPipeline, depth: NDArray[np.uint16], joints: NDArray[np.float64] | None = None) -> Work:
-    """The stages that peers have, too: expected depth, foreground, voxels, density."""
+    """Run the stages that peers have, too: expected depth, foreground, voxels, density."""
 
     def work(n: int) -> Part:
         times = pipeline.process(depth[n], None if joints is None else joints[n]).times
@@ -230,7 +230,7 @@ def _to_voxels(pipeline: DepthPipeline, depth: NDArray[np.uint16], joints: NDArr
 
 
 def single_thread() -> None:
-    """Ours has one thread; before they are imported, have the peers on one, too."""
+    """Restrict the peers to one thread, as ours. It must run before they are imported."""
     os.environ.update(OMP_NUM_THREADS="1", TBB_NUM_THREADS="1")
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
@@ -257,9 +257,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="make bench-pipeline", description="What a frame costs, beside its peers.")
-    parser.add_argument("--turns", type=int, default=25, help=f"of {FRAMES_A_TURN} frames each; the median counts (25)")
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for pipeline.json")
+    parser = argparse.ArgumentParser(
+        prog="make bench-pipeline", description="Measure the cost of a frame beside its peers."
+    )
+    parser.add_argument(
+        "--turns", type=int, default=25, help=f"turns of {FRAMES_A_TURN} frames each; the median counts (25)"
+    )
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="folder for pipeline.json")
     return parser
 
 

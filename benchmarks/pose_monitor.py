@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make bench-pose-monitor`: how soon a knocked or covered camera is told, and how often a still one is suspected.
+"""`make bench-pose-monitor`: measure the time until a knocked or covered camera is reported, and the rate of false
+alarms.
 
-Cameras of the demo cell with a D435i's faults, people who walk and reach before them, the robot moving. A false alarm
-is a look at which a camera that nobody touched is called moved or blind.
+The cameras of the demo cell have a D435i's faults. People walk and reach before them, and the robot moves. A false
+alarm is a check in which an untouched camera is reported as moved or blind.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from benchmarks.reporting.report import RESULTS, Mark, Result, line, write
 from benchmarks.sweeps import runner
-from edge_unit.monitoring import Stance
+from edge_unit.monitoring import PoseMonitor
 from edge_unit.monitoring.pose_monitor import BASELINE_LOOKS_MAX, PERIOD_S, WINDOW
 from edge_unit.pipeline import DepthPipeline
 from shared.camera import Intrinsics
@@ -30,10 +31,10 @@ from simulation.world.world import World
 
 CAMERAS = 4
 
-TOLD_S_MAX = 2.0
+REPORTED_S_MAX = 2.0
 
-LOOKS_AFTER = 12
-"""A knock that was not told by then counts as missed: longer than `TOLD_S_MAX`."""
+CHECKS_AFTER = 12
+"""Checks after a knock. A knock that is not reported by then counts as missed: longer than `REPORTED_S_MAX`."""
 
 KNOCKS = {
     "turned by 1 degree": (np.radians(1.0), 0.0),
@@ -46,24 +47,24 @@ KNOCKS = {
     "covered": (0.0, 0.0),
     "dazzled over two thirds": (0.0, 0.0),
 }
-"""Turn in rad and shift in m, each in a random direction."""
+"""Rotation in rad and shift in m, each in a random direction."""
 
 COVERED = {"covered": 1.0, "dazzled over two thirds": 0.67}
-"""Share of the picture, from the left, in which nothing is measured."""
+"""Share of the image, from the left, that has no measurement."""
 
 
 @dataclass(frozen=True)
-class Told:
-    """What became of one camera: for each knock, seconds until it was told (NaN: never) and until it was over."""
+class KnockTimes:
+    """Results of one camera: per knock, seconds until it was reported (NaN: never) and until the report ended."""
 
-    told_s: dict[str, list[float]]
+    reported_s: dict[str, list[float]]
     back_s: dict[str, list[float]]
     quiet_looks: int
     alarms: list[str]
 
 
-class Watch:
-    """One camera, looked at as its unit does."""
+class WatchedCamera:
+    """One camera, checked as its unit checks it."""
 
     def __init__(self, number: int, people: int, intrinsics: Intrinsics, folder: Path) -> None:
         self.world = World.demo(people=people, seed=number)
@@ -71,12 +72,12 @@ class Watch:
         self.intrinsics = intrinsics
         self.number = number
         self.pipeline = DepthPipeline(intrinsics, self.pose, self.world.cell)
-        self.stance = Stance(folder)
+        self.stance = PoseMonitor(folder)
         self.stance.begin("here")
         self.t_s = 0.0
 
-    def look(self, eye: SimulatedCamera, hidden: float = 0.0) -> str:
-        """One look; the reason why the view is not to be trusted, if there is one."""
+    def check(self, eye: SimulatedCamera, hidden: float = 0.0) -> str:
+        """Run one check. Return the reason if the view is not trusted, else an empty text."""
         frame = eye.capture(self.t_s)
         depth = frame.depth
         if hidden:
@@ -88,37 +89,37 @@ class Watch:
         return verdict.reason
 
     def eye(self, knock: Transform) -> SimulatedCamera:
-        """The camera, hanging at `knock` beside its place."""
+        """Return the camera, displaced by `knock` from its place."""
         return SimulatedCamera(self.world, self.pose @ knock, self.intrinsics, seed=self.number)
 
-    def seconds_until(self, told: bool, eye: SimulatedCamera, hidden: float) -> float:
-        """Until it is told that the view is not to be trusted, or that it is again."""
-        for looks in range(1, LOOKS_AFTER + 1):
-            if bool(self.look(eye, hidden)) == told:
-                return looks * PERIOD_S
+    def seconds_until(self, reported: bool, eye: SimulatedCamera, hidden: float) -> float:
+        """Return the seconds until the view is reported as not trusted, or as trusted again."""
+        for checks in range(1, CHECKS_AFTER + 1):
+            if bool(self.check(eye, hidden)) == reported:
+                return checks * PERIOD_S
         return float("nan")
 
 
-def watch(number: int, people: int, size: tuple[int, int], quiet_s: float, trials: int) -> Told:
-    """All about one camera."""
+def watch(number: int, people: int, size: tuple[int, int], quiet_s: float, trials: int) -> KnockTimes:
+    """Run all trials of one camera."""
     rng = np.random.default_rng(number)
     with tempfile.TemporaryDirectory(prefix="cellwatch-stance-") as folder:
-        one = Watch(number, people, d435i_intrinsics(*size), Path(folder))
+        one = WatchedCamera(number, people, d435i_intrinsics(*size), Path(folder))
         still = one.eye(np.eye(4))
-        quiet = [one.look(still) for _ in range(max(round(quiet_s / PERIOD_S), BASELINE_LOOKS_MAX))]
-        told_s: dict[str, list[float]] = {name: [] for name in KNOCKS}
+        quiet = [one.check(still) for _ in range(max(round(quiet_s / PERIOD_S), BASELINE_LOOKS_MAX))]
+        reported_s: dict[str, list[float]] = {name: [] for name in KNOCKS}
         back_s: dict[str, list[float]] = {name: [] for name in KNOCKS}
         for name, (turn_rad, shift_m) in KNOCKS.items():
             for _ in range(trials):
                 knock = from_xyz_rpy(shift_m * _direction(rng), turn_rad * _direction(rng))
-                told_s[name].append(one.seconds_until(True, one.eye(knock), COVERED.get(name, 0.0)))
+                reported_s[name].append(one.seconds_until(True, one.eye(knock), COVERED.get(name, 0.0)))
                 back_s[name].append(one.seconds_until(False, still, 0.0))
                 one.t_s += float(rng.uniform(0.0, 20.0))
-        return Told(told_s, back_s, len(quiet), [reason for reason in quiet if reason])
+        return KnockTimes(reported_s, back_s, len(quiet), [reason for reason in quiet if reason])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure; the table, the marks, and all of it as one line of JSON. Exit code 1 when a mark is missed."""
+    """Measure, then print the table, the marks and one line of JSON. The exit code is 1 when a mark is missed."""
     options = _parser().parse_args(arguments)
     jobs = [
         partial(watch, number, people, options.resolution, 3600.0 * options.hours / 2.0, options.trials)
@@ -126,26 +127,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for number in range(CAMERAS)
     ]
     with runner(options.processes) as run:
-        found: list[Told] = run(jobs)
+        found: list[KnockTimes] = run(jobs)
     rows = []
     marks = []
     for name in KNOCKS:
-        told = np.array([seconds for one in found for seconds in one.told_s[name]])
+        reported = np.array([seconds for one in found for seconds in one.reported_s[name]])
         back = np.array([seconds for one in found for seconds in one.back_s[name]])
-        late = float(np.mean(~(told <= TOLD_S_MAX)))
-        rows.append((name, len(told), float(np.nanmedian(told)), float(np.nanmax(told)), 100.0 * late, _worst(back)))
-        marks.append(Mark(f"{name}: % not told within {TOLD_S_MAX:g} s", 100.0 * late, at_most=0.0))
+        late = float(np.mean(~(reported <= REPORTED_S_MAX)))
+        rows.append(
+            (name, len(reported), float(np.nanmedian(reported)), float(np.nanmax(reported)), 100.0 * late, _worst(back))
+        )
+        marks.append(Mark(f"{name}: % not reported within {REPORTED_S_MAX:g} s", 100.0 * late, at_most=0.0))
     hours = sum(one.quiet_looks for one in found) * PERIOD_S / 3600.0
     alarms = [reason for one in found for reason in one.alarms]
     marks.append(Mark("false alarms, looks", float(len(alarms)), at_most=0.0))
     size = "{}x{}".format(*options.resolution)
-    looks = f"{len(alarms)} of {round(hours * 3600.0 / PERIOD_S)} looks in {hours:.2f} camera hours were false alarms"
+    checks = f"{len(alarms)} of {round(hours * 3600.0 / PERIOD_S)} checks in {hours:.2f} camera hours were false alarms"
     result = Result(
         f"Cameras knocked, covered and dazzled while one or two people walk, {size}",
         ("what", "trials", "told s, median", "worst", "% late", "over s, worst"),
         tuple(rows),
         tuple(marks),
-        (looks, *sorted(set(alarms))),
+        (checks, *sorted(set(alarms))),
     )
     print(result)
     document = result.document() | {
@@ -166,8 +169,8 @@ def _direction(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _worst(seconds: NDArray[np.float64]) -> float:
-    """The longest, or as long as was waited for when it did not come to an end."""
-    return float(np.max(np.where(np.isnan(seconds), LOOKS_AFTER * PERIOD_S, seconds)))
+    """Return the longest time. A time that did not end counts as the longest wait."""
+    return float(np.max(np.where(np.isnan(seconds), CHECKS_AFTER * PERIOD_S, seconds)))
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -177,17 +180,17 @@ def _size(text: str) -> tuple[int, int]:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="make bench-pose-monitor", description="Knocked, covered, and untouched cameras."
+        prog="make bench-pose-monitor", description="Measure knocked, covered and untouched cameras."
     )
-    parser.add_argument("--hours", type=float, default=0.1, help="of each of the four cameras, untouched (0.1)")
-    parser.add_argument("--trials", type=int, default=4, help="of each knock, camera and number of people (4)")
+    parser.add_argument("--hours", type=float, default=0.1, help="hours of each of the four cameras, untouched (0.1)")
+    parser.add_argument("--trials", type=int, default=4, help="trials of each knock, camera and number of people (4)")
     parser.add_argument("--resolution", type=_size, default=(424, 240), metavar="WxH", help="(424x240)")
-    parser.add_argument("--processes", type=int, default=2, help="at once (2)")
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for pose_monitor.json")
+    parser.add_argument("--processes", type=int, default=2, help="number of processes (2)")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="folder for pose_monitor.json")
     return parser
 
 
-assert LOOKS_AFTER > WINDOW
+assert CHECKS_AFTER > WINDOW
 
 if __name__ == "__main__":
     sys.exit(main())

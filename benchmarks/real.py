@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make real`: a real master and a real unit on recorded frames of a real cell, judged frame by frame.
+"""`make real`: run a real master and a real unit on recorded frames of a real cell, judged frame by frame.
 
-The unit plays the recording: from the frames of the empty cell it learns the background, then it watches those in which
-a second robot stands. The merged map must hold the second robot, and nothing of the robot that it knows. It does so
-twice: from the images as they are, and from an SDK recording of them through the RealSense source.
+The unit plays the recording. It learns the background model from the frames of the empty cell, then watches the frames
+in which a second robot stands. The merged map must hold the second robot, and nothing of the known robot. The run is
+done twice: from the images as they are, and from an SDK recording of them through the RealSense source.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from simulation.fleet.processes import Child, Processes
 from simulation.fleet.running_master import RunningMaster, start_master
 
 READY_S = 60.0
-"""For a process to come up and compile its kernels on a slow machine."""
+"""Time limit for a process to start and compile its kernels on a slow machine."""
 
 FRAME_S = 1.0
-"""How long each frame is shown: long enough to ask for the map that it made."""
+"""Duration of each frame: long enough to read the map that it made."""
 
 POLL_S = 0.05
 
@@ -53,22 +53,22 @@ MISS_PERCENT_MAX = 2.5
 SECOND_ROBOT_VOXELS_MIN = 90.0
 
 PICTURE_DEPTH_M = 4.0
-"""Depth that is drawn in the last colour."""
+"""Depth with the last colour of the scale."""
 
 ORDER = [*EMPTY_FRAMES, *WATCHED_FRAMES]
-"""In which the recording is played: first it learns, then it watches."""
+"""Order of the recording: first the frames for learning, then those for watching."""
 
 
 @dataclass(frozen=True, eq=False)
 class SeenMap:
-    """The merged map that one frame made, and what it cost the unit."""
+    """The merged map of one frame, and its cost to the unit."""
 
     keys: NDArray[np.uint32]
     process_ms: float
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run; prints one JSON line last. Exit code 1 when a mark is missed."""
+    """Run both recordings and print one JSON line last. The exit code is 1 when a mark is missed."""
     options = _parser().parse_args(arguments)
     try:
         folder = real_frames.find()
@@ -80,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         frames = real_frames.load(folder, pipeline)
         print("playing the images ...", flush=True)
         maps = asyncio.run(play(folder, images))
-        print("writing them as an SDK recording, and playing that ...", flush=True)
+        print("writing the images as an SDK recording, and playing it ...", flush=True)
         recorded = asyncio.run(play_recording(folder, images))
     except CellwatchError as error:
         print(f"make real: {error}", file=sys.stderr)
@@ -92,13 +92,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 async def play_recording(folder: Path, images: RecordedSourceConfig) -> dict[int, SeenMap]:
-    """The same frames as an SDK recording, through the RealSense source."""
+    """Play the same frames as an SDK recording, through the RealSense source."""
     with tempfile.TemporaryDirectory(prefix="cellwatch-recording-") as scratch:
         recording, joints_file = Path(scratch) / "frames.db3", Path(scratch) / "joints.csv"
         await asyncio.to_thread(record_images, images.model_copy(update={"fps": None}), recording)
         joints = np.loadtxt(folder / "joint_states_rad.csv", delimiter=",")
         np.savetxt(joints_file, joints[ORDER], delimiter=",", fmt="%.12f")
-        # Frame by frame: at its own pace the first would be over before the unit had its cell.
+        # Frame by frame: at its own pace the recording would be over before the unit has its cell.
         source = RealsenseSourceConfig(
             recording=recording, joints_file=joints_file, fx_stereo=real_frames.STEREO_FOCAL_PX, real_time=False
         )
@@ -106,10 +106,10 @@ async def play_recording(folder: Path, images: RecordedSourceConfig) -> dict[int
 
 
 async def play(folder: Path, source: SourceConfig) -> dict[int, SeenMap]:
-    """Have a real unit play the frames to a real master; returns what each frame that was watched became.
+    """Run a real unit that plays the frames and a real master. Return the map of each watched frame.
 
-    Of images, which are shown at leisure, that is the merged map; of a recording what the unit reported, and the map of
-    the last frame.
+    For images, which are played slowly, it is the merged map. For a recording it is the unit's report, and the merged
+    map of the last frame.
     """
     with tempfile.TemporaryDirectory(prefix="cellwatch-real-") as scratch:
         state = Path(scratch)
@@ -140,7 +140,7 @@ async def play(folder: Path, source: SourceConfig) -> dict[int, SeenMap]:
 
 
 def judge(frames: RealFrames, maps: dict[int, SeenMap], recorded: dict[int, SeenMap], out: Path) -> dict[str, Any]:
-    """Print the figures of each frame, draw its picture, and sum up."""
+    """Print the figures of each frame, draw its plot, and sum up."""
     out.mkdir(parents=True, exist_ok=True)
     judged: list[FrameMarks] = []
     rows: list[tuple[str | float, ...]] = []
@@ -192,7 +192,7 @@ def judge(frames: RealFrames, maps: dict[int, SeenMap], recorded: dict[int, Seen
 
 
 def draw(frames: RealFrames, frame: int, keys: NDArray[np.uint32]) -> NDArray[np.uint8]:
-    """Four pictures in one: depth, expected depth, surviving pixels on colour, voxels on colour."""
+    """Draw four panels in one image: depth, expected depth, surviving pixels on colour, voxels on colour."""
     depth, joints = frames.depth[frame], frames.joints[frame]
     scale_m = frames.pipeline.intrinsics.depth_scale_m
     measured = _coloured(depth * scale_m)
@@ -212,7 +212,7 @@ def draw(frames: RealFrames, frame: int, keys: NDArray[np.uint32]) -> NDArray[np
 
 
 def _coloured(depth_m: NDArray[Any]) -> NDArray[np.uint8]:
-    """Near is warm, far is cold, black is unknown."""
+    """Colour a depth image: near is warm, far is cold, black is unknown."""
     known = np.isfinite(depth_m) & (depth_m > 0.0)
     share = np.where(known, 1.0 - np.clip(np.where(known, depth_m, 0.0) / PICTURE_DEPTH_M, 0.0, 1.0), 0.0)
     image = np.array(cv2.applyColorMap((255 * share).astype(np.uint8), cv2.COLORMAP_TURBO), np.uint8)
@@ -221,12 +221,12 @@ def _coloured(depth_m: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 async def _watch(client: httpx.AsyncClient, unit: Child) -> dict[int, SeenMap]:
-    """Ask for the merged map until there is one of each watched frame."""
+    """Poll the merged map until there is one of each watched frame."""
     maps: dict[int, SeenMap] = {}
     deadline_ns = monotonic_ns() + round((READY_S + len(ORDER) * FRAME_S) * NS_PER_S)
     while set(maps) != set(WATCHED_FRAMES):
         if monotonic_ns() > deadline_ns or unit.failed:
-            raise SourceError(f"the unit did not show all frames, only {sorted(maps)}; {unit.log_tail()}")
+            raise SourceError(f"the unit did not report all frames, only {sorted(maps)}; {unit.log_tail()}")
         before = await _row(client)
         keys = await _voxels(client)
         after = await _row(client)
@@ -239,13 +239,13 @@ async def _watch(client: httpx.AsyncClient, unit: Child) -> dict[int, SeenMap]:
 
 
 async def _voxels(client: httpx.AsyncClient) -> NDArray[np.uint32]:
-    """Keys (N,) of the merged map."""
+    """Return the keys (N,) of the merged map."""
     answer = (await client.get("/voxels", params={"form": "keys"})).raise_for_status().json()
     return np.array(answer["voxels"], np.uint32)
 
 
 async def _row(client: httpx.AsyncClient) -> dict[str, Any] | None:
-    """The only unit, if it is there."""
+    """Return the row of the only unit, or None."""
     units = (await client.get("/units")).raise_for_status().json()
     rows: list[dict[str, Any]] = units["units"] if isinstance(units, dict) else units
     return rows[0] if rows else None
@@ -254,7 +254,7 @@ async def _row(client: httpx.AsyncClient) -> dict[str, Any] | None:
 async def _start_unit(
     processes: Processes, state: Path, master: RunningMaster, folder: Path, source: SourceConfig
 ) -> Child:
-    """A real unit that learns from the first frames and watches the rest."""
+    """Start a real unit that learns from the first frames and watches the others."""
     config = {
         "master_url": master.url,
         "token_file": str(master.unit_token_file),
@@ -276,9 +276,9 @@ def _images(folder: Path) -> RecordedSourceConfig:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="make real", description="The filter on real frames, end to end.")
-    parser.add_argument("--out", type=Path, default=Path("out/real"), metavar="DIR", help="for the pictures")
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for real.json")
+    parser = argparse.ArgumentParser(prog="make real", description="Run the filter on real frames, end to end.")
+    parser.add_argument("--out", type=Path, default=Path("out/real"), metavar="DIR", help="folder for the plots")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="folder for real.json")
     return parser
 
 

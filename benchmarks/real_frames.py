@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The real recordings in `xarm7_realsense`, and what must come out of them.
+"""The real recordings in `xarm7_realsense`, and their ground truth.
 
-A RealSense looks at an xArm7; in frames 0 to 3 a second robot stands in the picture that is in no model, in frames
-4 to 9 it is gone. Where it stands, and which pixels are the xArm7, is known.
+A RealSense looks at an xArm7. In frames 0 to 3 a second robot stands in the image, which no model contains; in frames 4
+to 9 it is gone. Its place and the pixels of the xArm7 are known.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ profile. The recording was then aligned to the colour camera's 908 px."""
 CELL = Path(__file__).parent.parent / "assets" / "cells" / "xarm7" / "cell.yaml"
 
 SECOND_ROBOT_PIXELS = (325, 490, 285, 600)
-"""First and last column, first and last row of the second robot's pixels, its depth being 1.45 to 1.85 m."""
+"""First and last column, first and last row of the second robot's pixels. Its depth is 1.45 to 1.85 m."""
 
 SECOND_ROBOT_VOXELS = (315, 500, 275, 610)
-"""The same for the centres of its voxels, a voxel wider, 1.4 to 1.9 m."""
+"""The same for the centres of its voxels, one voxel wider, 1.4 to 1.9 m."""
 
 
 def find() -> Path:
-    """The folder of the recordings.
+    """Return the folder of the recordings.
 
     Raises:
-        SourceError: it is not there; the text says where it was looked for.
+        SourceError: the folder is not there; the text names the places that were searched.
     """
     beside = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
     named = os.environ.get("CELLWATCH_DATA")
@@ -53,13 +53,13 @@ def find() -> Path:
             return folder / NAME
     places = " nor ".join(str(folder / NAME) for folder in tried)
     raise SourceError(
-        f"the real recordings are not there: no {places}; CELLWATCH_DATA names the folder that holds them"
+        f"the real recordings are not there: no {places}; set CELLWATCH_DATA to the folder that holds them"
     )
 
 
 @dataclass(frozen=True)
 class FrameMarks:
-    """What came out of one watched frame."""
+    """Figures of one watched frame."""
 
     robot_leak_percent: float
     second_robot_miss_percent: float
@@ -82,14 +82,14 @@ class RealFrames:
     joints: NDArray[np.float64]
 
     def marks(self, frame: int, voxels: Voxels | NDArray[np.uint32]) -> FrameMarks:
-        """Judge the filter on a watched frame, and the voxels that were reported of it."""
+        """Judge our filter on a watched frame, and the voxels that were reported of it."""
         keys = voxels.keys if isinstance(voxels, Voxels) else voxels
         return self.judge(frame, self.pipeline.foreground(self.depth[frame], self.joints[frame]), keys)
 
     def judge(self, frame: int, survives: NDArray[np.bool_], keys: NDArray[np.uint32]) -> FrameMarks:
         """Judge any filter by the pixels (H, W) that survive it and by the voxels (N,) that it reports.
 
-        Where no second robot stands nothing of it can be missed: 0 %.
+        Without a second robot nothing of it can be missed: 0 %.
         """
         depth = self.depth[frame]
         robot = self.robot_mask[frame] & (depth > 0)
@@ -106,7 +106,7 @@ class RealFrames:
         )
 
     def project(self, keys: NDArray[np.uint32]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Column, row (N,) px and depth (N,) m of the middles of voxels."""
+        """Return column and row (N,) in px and depth (N,) in m of the centres of voxels."""
         lattice: Lattice = self.pipeline.lattice
         T_world_camera = self.pipeline.T_world_camera
         centres_m = lattice.centres(lattice.indices(keys))
@@ -115,7 +115,7 @@ class RealFrames:
         return u, v, points_camera_m[:, 2]
 
     def _second_robot(self, frame: int) -> NDArray[np.bool_]:
-        """Its pixels (H, W)."""
+        """Return the pixels (H, W) of the second robot."""
         first_u, last_u, first_v, last_v = SECOND_ROBOT_PIXELS
         depth = self.depth[frame]
         found = (depth >= 1450) & (depth <= 1850) & ~self.robot_mask[frame]
@@ -125,7 +125,7 @@ class RealFrames:
 
 
 def load(folder: Path, pipeline: DepthPipeline) -> RealFrames:
-    """Read all frames, and have `pipeline` learn the empty ones.
+    """Read all frames, and let `pipeline` learn the empty ones.
 
     Raises:
         SourceError: a file is missing.
@@ -140,13 +140,13 @@ def load(folder: Path, pipeline: DepthPipeline) -> RealFrames:
 
 
 def cell(folder: Path) -> Cell:
-    """The cell of the recordings, whose robot lies beside them."""
+    """Return the cell of the recordings, whose robot model is in the same folder."""
     os.environ["CELLWATCH_DATA"] = str(folder.parent)
     return Cell.load(CELL)
 
 
 def default_settings() -> FilterSettings:
-    """One set for everything."""
+    """Return the default settings, the same for all frames."""
     return FilterSettings()
 
 

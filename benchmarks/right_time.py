@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make right-time`: is the robot filtered where it was when the frame was taken?
+"""`make right-time`: test that the robot is filtered in its pose at the time of the frame.
 
-A UR3e whose tool moves at 1 m/s, on sinusoids and with sharp reversals, under a D435i of 848x480 at 15 fps; a box of
-10 cm in no model stands 15 cm beside the arm in every frame, on either side by turns. Rays are cast by Embree, with the
-camera's faults on them. Its joints reach the master late, in many ways, and the unit from there by the very code that
-runs; a frame arrives `FRAME_LATENCY_S` after its capture. Prints a table for each question, and all of it as one line
-of JSON; a whole run leaves that in `out/results/right_time.json`. Exits with 1 when a mark is missed.
+A UR3e's tool moves at 1 m/s, on sinusoids and with sharp reversals, in view of a D435i of 848x480 at 15 fps. A box of
+10 cm, which no model contains, stands 15 cm beside the arm in every frame, on alternating sides. Embree casts the rays,
+and the camera's faults are added. The joints reach the master late, in many ways, and then the unit by the code of the
+product. A frame arrives `FRAME_LATENCY_S` after its capture. The command prints a table for each question, and all
+figures as one line of JSON; a whole run writes `out/results/right_time.json`. The exit code is 1 when a mark is missed.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ from benchmarks.joint_delivery import Delivered, Delivery
 from benchmarks.reporting.report import RESULTS, Mark, Result, line, write
 from benchmarks.sweep_scenes.stage import reported_at
 from benchmarks.sweeps import runner
-from edge_unit.joints import DelayEstimate, DelayLook, JointEstimate, estimate_delay
-from edge_unit.joints import look_at as look_at_frame
+from edge_unit.joints import DelayComparison, DelayEstimate, JointEstimate, compare_frame, estimate_delay
 from edge_unit.joints.delay_monitor import LOOKS_MAX
 from edge_unit.pipeline import DepthPipeline, Voxels
 from shared.camera import Intrinsics
@@ -44,18 +43,19 @@ FRAMES = 500
 FPS = 15.0
 
 FRAME_LATENCY_S = 0.02
-"""From the capture to the unit: 15 to 50 ms with a D435, so this leaves samples little time to arrive."""
+"""Time from the capture to the unit: 15 to 50 ms with a D435, so this leaves little time for samples to arrive."""
 
 HOLD_S = 0.02
-"""How long a frame might wait for its joints: it reaches the map later by as much. Units do not wait; it is measured to
-tell what that would be worth."""
+"""Time that a frame might wait for its joints, which delays it in the map. Units do not wait; the benchmark measures
+the possible gain.
+"""
 
 T_WORLD_CAMERA = look_at((0.9, 0.0, 1.2), (0.25, 0.0, 0.2))
 
 BOX_M, GAP_M = 0.10, 0.15
 
 VISIBLE_PART = 0.5
-"""Of a face of the box: with less of it in view it need not be reported."""
+"""Share of a face of the box. With less of it in view the box need not be reported."""
 
 HOME_RAD = np.array((0.0, -1.25, 1.35, -1.67, -1.57, 0.0))
 SWING_RAD = np.array((0.9, 0.12, 0.15, 0.2, 0.0, 0.5))
@@ -67,7 +67,7 @@ WRISTS = slice(4, 8)
 
 
 def paths() -> dict[str, JointPath]:
-    """The robot's ways: at its tool up to 1.2 m/s (median 0.8) on sines, 1.05 m/s (median 0.94) with reversals."""
+    """Return the robot's paths: tool up to 1.2 m/s (median 0.8) on sines, 1.05 m/s (median 0.94) with reversals."""
     phase_rad = np.arange(len(HOME_RAD))[None, :].astype(np.float64)
     return {
         "sines": RobotPath(HOME_RAD, SWING_RAD[None, :], phase_rad, 2.0 * np.pi * SWING_RAD[0] / 3.0),
@@ -76,10 +76,10 @@ def paths() -> dict[str, JointPath]:
 
 
 def deliveries() -> tuple[Delivery, ...]:
-    """The ways in which joints come; the first two are the usual ones."""
+    """Return the kinds of joint delivery; the first two are the usual ones."""
     late = Delivery("125 Hz, 40 ms late, with times")
-    arrival = Delivery("125 Hz, 40 ms late, no times", stamped=False, told_delay_s=0.04)
-    jittery = replace(arrival, jitter_s=0.01, told_delay_s=0.05)
+    arrival = Delivery("125 Hz, 40 ms late, no times", stamped=False, configured_delay_s=0.04)
+    jittery = replace(arrival, jitter_s=0.01, configured_delay_s=0.05)
     slow = replace(late, rate_hz=30.0)
     return (
         late,
@@ -93,31 +93,31 @@ def deliveries() -> tuple[Delivery, ...]:
         replace(jittery, name="no times, jitter 10 ms"),
         replace(jittery, name="no times, jitter 10 ms, no velocities", velocities=False),
         replace(arrival, name="no times, 30 Hz, jitter, 5 % lost", rate_hz=30.0, jitter_s=0.01, lost_share=0.05,
-                told_delay_s=0.05),
+                configured_delay_s=0.05),
     )  # fmt: skip
 
 
 WORST = ("30 Hz, jitter, 5 % lost, no velocities", "no times, jitter 10 ms, no velocities")
-"""Where waiting would gain most."""
+"""Deliveries with the largest gain from waiting."""
 
 DELAYS_S = (0.0, 0.02, 0.043, 0.08, 0.12)
-"""True ones, to be found."""
+"""True delays, which the estimate must find."""
 
-LOOK_S = 0.5
-"""Between two looks of a running unit; the delay is estimated from as many as it keeps."""
+FRAME_SPACING_S = 0.5
+"""Time between two frames of the delay estimate in a running unit. The estimate uses as many as the unit keeps."""
 
 DELAY_ERROR_MAX_S = 0.005
 
 RIG_CAMERA = 1
 """A camera at a corner of the cell, at twice the distance."""
 
-UNTOLD = Delivery("no times, 40 ms late, delay not told", stamped=False)
-"""What comes of it when nobody sets `joint_delay_s`; bound to no mark."""
+UNCONFIGURED = Delivery("no times, 40 ms late, delay not told", stamped=False)
+"""Result if nobody sets `joint_delay_s`; it has no mark."""
 
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """One frame: its depth (H, W), when it was captured, the box in it, and whether that can be seen."""
+    """One frame: its depth (H, W), its capture time, the box in it, and whether the box is visible."""
 
     depth: NDArray[np.uint16]
     captured_s: float
@@ -127,7 +127,7 @@ class Watched:
 
 @dataclass(frozen=True)
 class Found:
-    """What came of one delivery on one path. Of each frame: whether it showed robot, kept the box, and its padding."""
+    """Results of one delivery on one path. Per frame: robot voxels reported, box kept, and the padding."""
 
     path: str
     delivery: str
@@ -150,7 +150,7 @@ class Stage:
         self._mesh = box_mesh("box", (BOX_M, BOX_M, BOX_M))
 
     def frame(self, number: int) -> Watched:
-        """The frame of this number, with noise of its own."""
+        """Return the frame of this number, with noise of its own."""
         t_s = number / FPS
         scene = self.world.scene(t_s)
         box = self._box(t_s, -1.0 if number % 2 else 1.0)
@@ -161,7 +161,7 @@ class Stage:
         return Watched(self._sensor.measure(view.z_m, number), t_s, box, visible)
 
     def _box(self, t_s: float, side: float) -> Body:
-        """The box at the height and distance of the tool, its near face `GAP_M` from the arm there."""
+        """Return the box at the height and distance of the tool. Its near face is `GAP_M` from the arm there."""
         robot, joints = self.world.cell.robot, self.world.joints_at(t_s)
         assert robot is not None
         assert joints is not None
@@ -178,7 +178,7 @@ class Stage:
 def watch(
     name: str, cases: Sequence[tuple[Delivery, float]], frames: int, intrinsics: Intrinsics, settings: Settings
 ) -> list[Found]:
-    """The robot on the path of this name: exact joints, then each delivery with how long frames wait for it."""
+    """Run the path of this name: first with exact joints, then with each delivery and its waiting time of frames."""
     path = paths()[name]
     stage = Stage(path, intrinsics)
     watched = [stage.frame(number) for number in range(frames)]
@@ -236,7 +236,7 @@ def _judge(
 
 
 def _others(voxels: Voxels, box: Body) -> int:
-    """How many voxels are reported away from the box: there is nothing else in no model, so they are robot."""
+    """Return the number of voxels away from the box. Nothing else is unknown, so they belong to the robot."""
     if not len(voxels):
         return 0
     reach_m = 0.5 * BOX_M * np.sqrt(3.0) + 2.0 * voxels.lattice.voxel_size_m
@@ -245,7 +245,7 @@ def _others(voxels: Voxels, box: Body) -> int:
 
 
 def result(found: Sequence[Found], bound: Sequence[str]) -> Result:
-    """One row a case; those named in `bound` must meet the marks."""
+    """Return one row per case. The cases named in `bound` have marks."""
     rows: list[tuple[str | float, ...]] = []
     marks: list[Mark] = []
     for each in found:
@@ -268,7 +268,7 @@ def result(found: Sequence[Found], bound: Sequence[str]) -> Result:
 
 @dataclass(frozen=True)
 class DelayFound:
-    """What was estimated of one true delay."""
+    """Estimate of one true delay."""
 
     path: str
     camera: str
@@ -277,7 +277,7 @@ class DelayFound:
 
 
 def find_delays(name: str, at_corner: bool, looks: int, intrinsics: Intrinsics) -> list[DelayFound]:
-    """Joints whose times are late, from frames half a second apart in a cell with someone who walks about."""
+    """Estimate joints with late times, from frames half a second apart in a cell with a walking person."""
     path = {**paths(), "demo": RobotPath.demo()}[name]
     world = replace(World.demo(people=1), robot_path=path)
     pose = rig(world.cell)[RIG_CAMERA] if at_corner else T_WORLD_CAMERA
@@ -285,12 +285,12 @@ def find_delays(name: str, at_corner: bool, looks: int, intrinsics: Intrinsics) 
     settings = Settings()
     static_m = DepthPipeline(intrinsics, pose, world.cell, settings).expected_depth(None)
     assert world.cell.robot is not None
-    look = DelayLook(intrinsics, pose, world.cell.robot, static_m, settings)
-    frames = [(camera.capture(number * LOOK_S).depth, number * LOOK_S) for number in range(looks)]
+    look = DelayComparison(intrinsics, pose, world.cell.robot, static_m, settings)
+    frames = [(camera.capture(number * FRAME_SPACING_S).depth, number * FRAME_SPACING_S) for number in range(looks)]
     found = []
     for delay_s in DELAYS_S:
         late = partial(_late, path, delay_s)
-        misfits = [each for depth, t_s in frames if (each := look_at_frame(look, depth, t_s, late)) is not None]
+        misfits = [each for depth, t_s in frames if (each := compare_frame(look, depth, t_s, late)) is not None]
         found.append(DelayFound(name, "at a corner" if at_corner else "near", delay_s, estimate_delay(misfits)))
     return found
 
@@ -300,7 +300,7 @@ def _late(path: JointPath, delay_s: float, t_s: float) -> NDArray[np.float64]:
 
 
 def delays_result(found: Sequence[DelayFound]) -> Result:
-    """One row a delay, and a mark for the worst of them."""
+    """Return one row per delay, and a mark for the worst of them."""
     rows = tuple(
         (each.path, each.camera, 1e3 * each.delay_s, 1e3 * each.estimate.delay_s, 1e3 * each.estimate.uncertainty_s,
          each.estimate.looks)
@@ -314,12 +314,14 @@ def delays_result(found: Sequence[DelayFound]) -> Result:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run all cases."""
-    parser = argparse.ArgumentParser(prog="make right-time", description="The robot filtered where it was.")
-    parser.add_argument("--frames", type=int, default=FRAMES, help=f"of each path ({FRAMES})")
-    parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 2), help="how many work at a time")
+    parser = argparse.ArgumentParser(
+        prog="make right-time", description="Test the filtering of the robot with late joints."
+    )
+    parser.add_argument("--frames", type=int, default=FRAMES, help=f"frames of each path ({FRAMES})")
+    parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 2), help="number of processes")
     options = parser.parse_args(arguments)
     bound = [delivery.name for delivery in deliveries()]
-    cases = [(delivery, 0.0) for delivery in (*deliveries(), UNTOLD)]
+    cases = [(delivery, 0.0) for delivery in (*deliveries(), UNCONFIGURED)]
     cases += [(delivery, HOLD_S) for delivery in deliveries() if delivery.name in (bound[0], *WORST)]
     jobs = [partial(watch, name, cases, options.frames, d435i_intrinsics(), Settings()) for name in paths()]
     with runner(options.processes) as run:

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make bench-scale`: one master and more and more units, until it bends, and what a robot's map is worth meanwhile.
+"""`make bench-scale`: one master with an increasing number of units up to its limit, and the age of a robot's map
+meanwhile.
 
-A real master on loopback has one core of this machine to itself; units (each at an address of its own), the robot's
-controller and two robots that read the map share another. Frames are 20 ms old when their update falls due, as those of
-real cameras are. Where the master refuses more units, another that takes as many as a voxel can have witnesses tells
-where the machine would bend. Prints tables, and at the end all of it as one line of JSON; exits with 1 when a mark is
-missed.
+A real master on loopback has one core of this machine to itself. The units (each with an address of its own), the
+robot's controller and two robots that read the map share another. Frames are 20 ms old when their update falls due, as
+those of real cameras are. If the master refuses more units, a second master with a limit of as many units as a voxel
+can have witnesses shows the limit of the machine. The command prints tables and, at the end, all figures as one line of
+JSON. The exit code is 1 when a mark is missed.
 """
 
 from __future__ import annotations
@@ -41,23 +42,23 @@ from simulation.world.world import DEMO_CELL
 UNITS = (1, 2, 4, 8, 16, 32, 50, 64, 100, 200)
 RATES_HZ = (15.0, 30.0)
 VOXELS = 300
-"""Of a person at 50 mm, as one camera sees them."""
+"""Voxels of a person at 50 mm, as one camera sees them."""
 
 SECONDS, WARM_UP_S = 4.0, 1.0
 
-ASK_S = 0.02
-"""A planner that asks 50 times a second."""
+POLL_S = 0.02
+"""Period of a planner that polls 50 times a second."""
 
 FULL_HZ, FULL_UNITS = 30.0, 50
-"""What a large cell asks of its master ..."""
+"""Load of a large cell."""
 
 AGE_MS_MAX = 100.0
-"""... and how old its oldest frame may be at a robot: 20 ms when it is sent, a period until the next, two reads."""
+"""Largest age of its oldest frame at a robot: 20 ms when it is sent, one period until the next, two reads."""
 
 
 @dataclass(frozen=True)
 class Ages:
-    """How old the youngest and the oldest frame of a map are when a robot has it, ms; and how many maps there were."""
+    """Ages in ms of the youngest and the oldest frame of a map when a robot has it, and the number of maps."""
 
     maps: int
     youngest_p50: float
@@ -66,7 +67,9 @@ class Ages:
 
 
 def ages(merged: NDArray[np.int64], readings: Sequence[Reading], begin_ns: int, end_ns: int) -> Ages:
-    """`merged` (N, 4) has of each update its unit, and when its frame was taken, the master had it and answered it."""
+    """Return the ages. `merged` (N, 4) has per update: its unit, and the times of capture, receipt by the master, and
+    answer.
+    """
     read = [reading for reading in readings if begin_ns <= reading.made_ns < end_ns]
     made_ns = np.array([reading.made_ns for reading in read], np.int64)
     newest_ns = np.empty((0, len(read)), np.int64)
@@ -85,22 +88,22 @@ def ages(merged: NDArray[np.int64], readings: Sequence[Reading], begin_ns: int, 
 
 @dataclass(frozen=True)
 class Row:
-    """One step, and what it meant for those who read."""
+    """One step, and its effect on the readers."""
 
     step: Step
-    asked: Ages
+    polled: Ages
     streamed: Ages
     wide: bool
 
     @property
     def carried(self) -> bool:
-        """Whether all arrived, the map was right, and no view of it grew stale."""
-        oldest_ms = np.max((self.asked.oldest_p99, self.streamed.oldest_p99))
+        """Return True if all updates arrived, the map was right, and no view in it went stale."""
+        oldest_ms = np.max((self.polled.oldest_p99, self.streamed.oldest_p99))
         return not (self.step.lost or self.step.map_wrong) and bool(oldest_ms < 1e3 * Settings().stale_after_s)
 
 
 class Bench:
-    """Starts masters, readers and loads, each on its core."""
+    """Starts masters, readers and loads, each on its own core."""
 
     def __init__(self, processes: Processes, folder: Path, options: argparse.Namespace) -> None:
         cores = sorted(os.sched_getaffinity(0))
@@ -109,10 +112,11 @@ class Bench:
         self._count = 0
 
     async def run(self, module: str, units: tuple[int, ...]) -> tuple[list[Row], dict[str, Any] | None]:
-        """Steps before a new master, up to where it refuses; and what it refused.
+        """Run the steps with a new master, up to the number of units that it refuses. Return the rows and the refused
+        step.
 
         Raises:
-            CellwatchError: something did not start, or ended before its time.
+            CellwatchError: a process did not start, or ended too early.
         """
         self._count += 1
         folder = self._folder / str(self._count)
@@ -132,7 +136,7 @@ class Bench:
             "benchmarks.load_generator.map_readers",
             url,
             operator,
-            str(ASK_S),
+            str(POLL_S),
             str(folder / "read"),
         )
         await until_written(readers, folder / f"read{BEGUN}", READY_S)
@@ -158,13 +162,15 @@ class Bench:
         rows = []
         for step in (Step(**fields) for fields in found if "refused" not in fields):
             merged = np.load(f"{result}.{step.units}-{step.rate_hz:g}.npz")["merged"]
-            asked, streamed = (ages(merged, readings[name], step.begin_ns, step.end_ns) for name in (ASKING, LISTENING))
-            rows.append(Row(step, asked, streamed, module != "master_server"))
+            polled, streamed = (
+                ages(merged, readings[name], step.begin_ns, step.end_ns) for name in (ASKING, LISTENING)
+            )
+            rows.append(Row(step, polled, streamed, module != "master_server"))
         return rows, next((fields for fields in found if "refused" in fields), None)
 
 
 async def measure(options: argparse.Namespace) -> tuple[list[Row], str]:
-    """All steps, and why the master as it is took no more."""
+    """Return all steps, and the reason for which the unmodified master took no more units."""
     with tempfile.TemporaryDirectory(prefix="cellwatch-scale-") as scratch:
         folder = Path(scratch)
         async with Processes(folder / "logs", without=(MASTER_PREFIX,)) as processes:
@@ -178,7 +184,7 @@ async def measure(options: argparse.Namespace) -> tuple[list[Row], str]:
 
 
 def load_result(rows: Sequence[Row], refused: str) -> Result:
-    """What the units and the machine had to bear."""
+    """Return the load on the units and on the machine."""
     columns = (
         "units", "each /s", "updates/s", "lost", "p50 ms", "p99 ms", "in master us", "p99 us", "bytes", "kB/s a unit",
         "CPU %", "CPU us", "waited %", "load CPU %", "map", "master",
@@ -194,9 +200,10 @@ def load_result(rows: Sequence[Row], refused: str) -> Result:
         ))  # fmt: skip
     remarks = [
         "p50, p99: round trip of an update, from when it fell due. in master: from its last byte to its answer.",
-        "bytes: update and answer with all headers and the seen report. CPU: of the master's process, with readers and "
-        "robot. waited: for the core, which others had: what is not the master's fault. load CPU: of what plays the "
-        "units; near 100 it is this that is late, not the master.",
+        "bytes: update and answer with all headers and the seen report. CPU: of the master's process, "
+        "with readers and robot. waited: time for which the master was ready but had no core, because of"
+        " other processes. load CPU: of the process that plays the units; near 100 this process is late,"
+        " not the master.",
     ]
     if refused:
         remarks.append(f"It stops at {MAX_UNITS} units because it is told to: {refused}")
@@ -223,23 +230,23 @@ def load_result(rows: Sequence[Row], refused: str) -> Result:
 
 
 def age_result(rows: Sequence[Row]) -> Result:
-    """How old a robot's map is."""
+    """Return the age of a robot's map."""
     columns = (
         "units", "each /s", "asked: maps", "youngest ms", "oldest ms", "oldest p99",
         "streamed: maps", "youngest ms ", "oldest ms ", "oldest p99 ",
     )  # fmt: skip
     table = [
-        (row.step.units, row.step.rate_hz, *asdict(row.asked).values(), *asdict(row.streamed).values()) for row in rows
+        (row.step.units, row.step.rate_hz, *asdict(row.polled).values(), *asdict(row.streamed).values()) for row in rows
     ]
     remark = (
         f"ms from a frame's capture until a robot has the map decoded, {AGE_NS / NS_PER_MS:g} of them before it is "
-        f"sent; medians and p99. Asked: GET /voxels every {1e3 * ASK_S:g} ms. Streamed: each message of WS /stream."
+        f"sent; medians and p99. Asked: GET /voxels every {1e3 * POLL_S:g} ms. Streamed: each message of WS /stream."
     )
     marks = []
     for row in rows:
         if (row.step.units, row.step.rate_hz) == (FULL_UNITS, FULL_HZ):
             name = f"{FULL_UNITS} units at {FULL_HZ:g}/s: oldest frame at a robot"
-            marks.append(Mark(f"{name} that asks, p99 ms", row.asked.oldest_p99, at_most=AGE_MS_MAX))
+            marks.append(Mark(f"{name} that asks, p99 ms", row.polled.oldest_p99, at_most=AGE_MS_MAX))
             marks.append(Mark(f"{name} that listens, p99 ms", row.streamed.oldest_p99, at_most=AGE_MS_MAX))
     if any(row.step.units == MAX_UNITS for row in rows):
         full = [row for row in rows if row.step.units == MAX_UNITS]
@@ -254,18 +261,19 @@ def age_result(rows: Sequence[Row]) -> Result:
 
 
 def cost_result(costs: Sequence[MergeCost]) -> Result:
-    """What the merge itself costs."""
+    """Return the cost of the merge itself."""
     columns = ("units", "voxels of the map", "merge us", "union us", "answer us")
     remark = (
-        "merge: one report in place of the one before. union: the keys of all, after a change; answer: indices and "
-        "witnesses as msgpack. Both once a picture of the stream (at most 100 a second) or a GET, not once an update."
+        "merge: one report replaces the one before. union: the keys of all after a change; answer: "
+        "indices and witnesses as msgpack. Both are made once per message of the stream (at most 100 a "
+        "second) or per GET, not per update."
     )
     rows = tuple(tuple(asdict(cost).values()) for cost in costs)
     return Result("The merge itself, in one process", columns, rows, remarks=(remark,))
 
 
 def cpu_fit(rows: Sequence[Row]) -> tuple[float, float] | None:
-    """Microseconds an update and per cent beside them, over the steps in which there was CPU left."""
+    """Fit microseconds per update and a constant percentage, over the steps in which the CPU was not full."""
     points = [(row.step.per_s, row.step.master_cpu_percent) for row in rows if row.step.master_cpu_percent < 90.0]
     if len(set(points)) < 3:
         return None
@@ -275,7 +283,7 @@ def cpu_fit(rows: Sequence[Row]) -> tuple[float, float] | None:
 
 
 def curves(rows: Sequence[Row]) -> list[Curves]:
-    """Round trips, ages and CPU over the number of units."""
+    """Return round trips, ages and CPU over the number of units."""
 
     def over(values: dict[str, Any]) -> dict[str, list[tuple[float, float]]]:
         return {
@@ -285,7 +293,7 @@ def curves(rows: Sequence[Row]) -> list[Curves]:
         }
 
     trips = {"p50": lambda row: row.step.p50_ms, "p99": lambda row: row.step.p99_ms}
-    oldest = {"GET p99": lambda row: row.asked.oldest_p99, "stream p99": lambda row: row.streamed.oldest_p99}
+    oldest = {"GET p99": lambda row: row.polled.oldest_p99, "stream p99": lambda row: row.streamed.oldest_p99}
     cpu = {"master": lambda row: row.step.master_cpu_percent, "load": lambda row: row.step.load_cpu_percent}
     return [
         Curves("Round trip of an update", "units", "ms", over(trips), "xy"),
@@ -333,12 +341,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="make bench-scale", description="One master and more and more units.")
+    parser = argparse.ArgumentParser(
+        prog="make bench-scale", description="Load one master with an increasing number of units."
+    )
     parser.add_argument("--units", type=int, nargs="+", default=UNITS, help=" ".join(map(str, UNITS)))
     parser.add_argument("--rates", type=float, nargs="+", default=RATES_HZ, help="updates/s of each unit (15 30)")
-    parser.add_argument("--voxels", type=int, default=VOXELS, help=f"in each update ({VOXELS})")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help=f"of each step ({SECONDS:g})")
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for scale.json")
+    parser.add_argument("--voxels", type=int, default=VOXELS, help=f"voxels of each update ({VOXELS})")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help=f"duration of each step ({SECONDS:g})")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="folder for scale.json")
     return parser
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make sweeps`: what the filter sees and does not see at its default settings, before cameras with a D435i's faults.
+"""`make sweeps`: measure the limits of the filter at its default settings, with cameras that have a D435i's faults.
 
-Rays are cast by Embree, so that no bug of the filter's own rasterizer can hide in both. Prints a table for each
-question, and all of it as one line of JSON at the end; a whole run leaves that in `out/results/sweeps.json`, too. Exits
-with 1 when a mark is missed.
+Embree casts the rays, so a bug of the filter's own rasterizer cannot hide in both. The command prints a table for each
+question and, at the end, all figures as one line of JSON; a whole run also writes `out/results/sweeps.json`. The exit
+code is 1 when a mark is missed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ QUICK_DISTANCES_M = (1.0, 2.0)
 ROD_TILTS_DEG = (shapes.ROD_TILT_MAX_DEG, 90.0)
 
 PART_FRAMES = 100
-"""Frames that a process takes at a time: long enough to be worth a cell and a camera, short enough to share well."""
+"""Frames per job of a process: enough to amortise a cell and a camera, few enough to balance the load."""
 
 Job = Callable[[], Any]
 Run = Callable[[Sequence[Job]], list[Any]]
@@ -43,7 +43,7 @@ Run = Callable[[Sequence[Job]], list[Any]]
 
 @dataclass(frozen=True)
 class Amount:
-    """How many of everything."""
+    """Number of frames and cases of a run."""
 
     boxes: int = 400
     curve_boxes: int = 100
@@ -59,7 +59,7 @@ class Amount:
 
 
 def quick(frames: int = 10, intrinsics: Intrinsics | None = None) -> Amount:
-    """Little of everything: for tests."""
+    """Return a small amount of everything, for tests."""
     return Amount(
         boxes=100,
         curve_boxes=20,
@@ -75,7 +75,7 @@ def quick(frames: int = 10, intrinsics: Intrinsics | None = None) -> Amount:
 
 
 def thickness_at_the_marks(amount: Amount, settings: FilterSettings, run: Run) -> Result:
-    """Boxes of the heights that must be reported."""
+    """Test boxes of the heights that must be reported."""
     return thickness.at_the_marks(run([
         partial(thickness.trial, distance_m, height_m, cad, amount.boxes, settings)
         for distance_m, height_m in thickness.MARKED
@@ -84,7 +84,7 @@ def thickness_at_the_marks(amount: Amount, settings: FilterSettings, run: Run) -
 
 
 def thickness_curve(amount: Amount, settings: FilterSettings, run: Run) -> Result:
-    """The thinnest box over distance."""
+    """Measure the thinnest box over distance."""
     points = run([
         partial(thickness.point, distance_m, amount.curve_boxes, settings) for distance_m in amount.curve_distances_m
     ])  # fmt: skip
@@ -92,7 +92,7 @@ def thickness_curve(amount: Amount, settings: FilterSettings, run: Run) -> Resul
 
 
 def plates_rods_speckle(amount: Amount, settings: FilterSettings, run: Run) -> Result:
-    """What must not be lost between voxels, and what must be."""
+    """Test things that must not be lost between voxels, and speckle that must be."""
     jobs: list[Job] = []
     for camera in shapes.CAMERAS:
         for distance_m in shapes.PLATE_DISTANCES_M:
@@ -105,14 +105,14 @@ def plates_rods_speckle(amount: Amount, settings: FilterSettings, run: Run) -> R
 
 
 def quiet_cell(amount: Amount, settings: FilterSettings, run: Run) -> Result:
-    """Nothing but the moving robot."""
+    """Test the cell with only the moving robot."""
     parts = quiet.parts(amount.frames, PART_FRAMES, amount.learned_too)
     found = run([partial(quiet.watch, part, amount.intrinsics, settings) for part in parts])
     return quiet.result(found, amount.intrinsics)
 
 
 def walking_people(amount: Amount, settings: FilterSettings, run: Run) -> Result:
-    """People beside the robot."""
+    """Test people beside the robot."""
     parts = [part for people in amount.people for part in walkers.parts(people, amount.moments, PART_FRAMES)]
     found = run([partial(walkers.watch, part, amount.intrinsics, settings) for part in parts])
     return walkers.result(found, amount.intrinsics)
@@ -124,18 +124,18 @@ _SWEEPS: dict[str, Callable[[Amount, FilterSettings, Run], Result]] = dict(
 
 
 def sweep(names: Sequence[str], amount: Amount, settings: FilterSettings, run: Run) -> Iterator[tuple[str, Result]]:
-    """The sweeps of these names, one after the other."""
+    """Run the sweeps of these names, one after the other."""
     for name in names:
         yield name, _SWEEPS[name](amount, settings, run)
 
 
 @contextmanager
 def runner(processes: int) -> Iterator[Run]:
-    """Runs jobs, in their order, in as many processes; in this one when it is 1."""
+    """Run jobs, in their order, in that many processes; in this one if it is 1."""
     if processes <= 1:
         yield lambda jobs: [job() for job in jobs]
         return
-    # Spawned, for a fork would copy the threads' locks but not the threads.
+    # Spawned, because a fork would copy the threads' locks but not the threads.
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
         yield lambda jobs: [future.result() for future in [pool.submit(job) for job in jobs]]
 
@@ -170,15 +170,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="make sweeps", description="What the filter sees and does not see.")
-    parser.add_argument("--quick", action="store_true", help="little of everything, in half a minute")
-    parser.add_argument("--only", nargs="+", choices=SWEEPS, help="not all of the sweeps")
+    parser = argparse.ArgumentParser(prog="make sweeps", description="Measure the limits of the filter.")
+    parser.add_argument("--quick", action="store_true", help="a small amount of everything, in half a minute")
+    parser.add_argument("--only", nargs="+", choices=SWEEPS, help="only these sweeps")
     parser.add_argument("--frames", type=int, help="frames of each camera in the quiet cell (1000, quick 10)")
     parser.add_argument(
         "--resolution", type=_resolution, default=(848, 480), help="of the cameras in the cell, as in 424x240 (848x480)"
     )
-    parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 8), help="how many work at a time")
-    parser.add_argument("--results", type=Path, help="folder for sweeps.json, also of a run that is not whole")
+    parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 8), help="number of processes")
+    parser.add_argument("--results", type=Path, help="folder for sweeps.json, also of a partial run")
     return parser
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `run` watches until told to stop, `doctor` looks for what is wrong, and four more.
+"""The command line: `run` watches until stopped, `doctor` checks the unit, and four more commands.
 
-`record-images` makes a recording of images, `joint-delay` tells how late a recording's joints are, `board` makes a PDF
-of the calibration board, `compile-kernels` what an image carries so that boards need not compile.
+`record-images` makes a recording of images, `joint-delay` estimates the delay of a recording's joints, `board` makes a
+PDF of the calibration board, `compile-kernels` compiles the kernels of an image so that boards need not compile.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ logger = logging.getLogger("edge_unit")
 
 
 def main(arguments: Sequence[str] | None = None, factories: SourceFactories | None = None) -> int:
-    """Run the command; what can be expected to go wrong is one line and exit code 1.
+    """Run the command; an expected failure is one line and exit code 1.
 
-    `factories` make sources in the place of the product's own, for the types of configuration that they name.
+    `factories` replace the product's own for the types of configuration that they name.
     """
     options = _parser().parse_args(arguments)
     options.factories = factories or {}
@@ -61,17 +61,17 @@ def _run(options: argparse.Namespace) -> int:
     config.read_token()
     if config.jit_cache_dir is not None:
         settle(config.jit_cache_dir)
-    # Imported only now, for kernels settle where they are kept when they are imported.
+    # Imported only now: kernels choose their cache folder at import.
     from edge_unit.daemon.unit import Unit
     from edge_unit.source_factory import FACTORIES, make_source
 
     source = make_source(config.source, {**FACTORIES, **options.factories})
-    asyncio.run(_until_told_to_stop(Unit(config, source)))
+    asyncio.run(_run_until_stopped(Unit(config, source)))
     return 0
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    """Print what is found as it is found; 1 when anything fails."""
+    """Print each finding as soon as it is known; returns 1 if any fails."""
     from edge_unit.doctor import Finding, examine
 
     overrides: dict[str, object] = {**assignments(options.set)}
@@ -117,7 +117,7 @@ def _board(options: argparse.Namespace) -> int:
     from shared.cell import board_of
     from shared.cell_file import read_cell_file
 
-    # Only what the file says of the board: what else it names need not be on this computer.
+    # Only the board's part of the file: other files that it names need not be on this computer.
     layout = BoardLayout.of(require_board(board_of(read_cell_file(options.cell))))
     page = page_of(layout, options.page or smallest_page(layout))
     write_board(layout, options.out, page)
@@ -131,21 +131,21 @@ def _compile_kernels(options: argparse.Namespace) -> int:
     if target is None or target.machine != platform.machine():
         raise ConfigError(f"--target: kernels are compiled on {platform.machine()} for {platform.machine()} only")
     folder = settle_for(target, options.folder)
-    from edge_unit.daemon.warm_up import rehearse
+    from edge_unit.daemon.warm_up import warm_up_kernels
     from geometry.rendering.hull_store import FOLDER as HULLS
 
-    rehearse()
+    warm_up_kernels()
     if options.config is not None:
         source = load(UnitConfig, options.config, os.environ, ENVIRONMENT_PREFIX, {}).source
         if isinstance(source, SimulatedSourceConfig):
-            asyncio.run(_look_once(SimulatedSource(source)))
-    # Hulls belong to a cell and are kept beside a unit's own kernels; a release carries none.
+            asyncio.run(_read_one_frame(SimulatedSource(source)))
+    # Hulls belong to a cell and lie beside a unit's own kernels; a release has none.
     shutil.rmtree(folder_beside(HULLS), ignore_errors=True)
     print(f"{folder}: {len(list(folder.rglob('*.nbi')))} kernels for {target.name}")
     return 0
 
 
-async def _look_once(source: DepthSource) -> None:
+async def _read_one_frame(source: DepthSource) -> None:
     await source.open()
     try:
         async with aclosing(source.frames()) as frames:
@@ -154,8 +154,8 @@ async def _look_once(source: DepthSource) -> None:
         await source.close()
 
 
-async def _until_told_to_stop(unit: Unit) -> None:
-    """Run to the end, or to a signal, and keep the service manager informed."""
+async def _run_until_stopped(unit: Unit) -> None:
+    """Run to the end, or to a signal, and notify the service manager."""
     task = asyncio.ensure_future(unit.run())
     manager = ServiceManager()
 
@@ -165,7 +165,7 @@ async def _until_told_to_stop(unit: Unit) -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop)
-    # Ready for whatever comes; a camera and a master may come later.
+    # The service is ready now; the camera and the master may come later.
     manager.ready(unit.status())
     informing = asyncio.ensure_future(manager.follow(unit.status, unit.stuck))
     try:
@@ -181,9 +181,9 @@ def _parser() -> argparse.ArgumentParser:
     levels = ("DEBUG", "INFO", "WARNING", "ERROR")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     variables = f"Every value may also be a variable, as in {ENVIRONMENT_PREFIX}MASTER_URL=http://10.0.0.2:8420."
-    run = commands.add_parser("run", help="watch and report until told to stop", epilog=variables)
+    run = commands.add_parser("run", help="watch and report until stopped", epilog=variables)
     run.set_defaults(command=_run)
-    doctor = commands.add_parser("doctor", help="tell what is missing or wrong, and what to do", epilog=variables)
+    doctor = commands.add_parser("doctor", help="report missing or wrong parts, with remedies", epilog=variables)
     doctor.set_defaults(command=_doctor)
     doctor.add_argument("--seconds", type=float, default=3.0, help="how long to watch the camera (default 3)")
     for each in (run, doctor):
@@ -192,8 +192,8 @@ def _parser() -> argparse.ArgumentParser:
     record.set_defaults(command=_record_images)
     record.add_argument("folder", metavar="DIR", help="16-bit PNG or npz images in depth/, with camera_info.yaml")
     record.add_argument("recording", type=Path, metavar="OUT.db3")
-    record.add_argument("--fps", type=float, default=15.0, help="its pace, also that of writing it (default 15)")
-    delay = commands.add_parser("joint-delay", help="how late a recording's joints are, by its frames")
+    record.add_argument("--fps", type=float, default=15.0, help="its rate, also that of writing it (default 15)")
+    delay = commands.add_parser("joint-delay", help="estimate the delay of a recording's joints from its frames")
     delay.set_defaults(command=_joint_delay)
     delay.add_argument(
         "folder",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The unit's own configuration; all else it is told by the master."""
+"""The unit's own configuration; the master sends all else."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Configured(BaseModel):
 
 
 class PoseConfig(Configured):
-    """Where the camera is: `xyz` in m with `rpy_deg` (roll, pitch, yaw, fixed axes), a 4x4 `matrix`, or a `file`."""
+    """The camera's pose: `xyz` in m with `rpy_deg` (roll, pitch, yaw, fixed axes), a 4x4 `matrix`, or a `file`."""
 
     xyz: tuple[float, float, float] | None = None
     rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -53,11 +53,11 @@ class PoseConfig(Configured):
         return self
 
     def transform(self) -> Transform:
-        """`T_world_camera`, optical frame.
+        """Return `T_world_camera`, optical frame.
 
         Raises:
             ConfigError: the file cannot be read.
-            InputError: it is no rigid transform.
+            InputError: it is not a rigid transform.
         """
         if self.xyz is not None:
             return from_xyz_rpy(self.xyz, np.radians(self.rpy_deg))
@@ -80,18 +80,18 @@ class UnitConfig(Configured):
 
     source: SourceConfig
     master_url: str | None = Field(
-        default=None, pattern=r"^https?://[^/\s]+/?$", description="Where the master is; left out, it is looked for."
+        default=None, pattern=r"^https?://[^/\s]+/?$", description="The master; absent: the unit searches for it."
     )
     cell: Text | None = Field(
         default=None,
         max_length=MAX_TEXT,
-        description="Name of the cell whose master is meant, where several are found.",
+        description="Name of the cell of the wanted master, if several masters are found.",
     )
     master_ca: Path | None = Field(
-        default=None, description="Certificates (PEM) of the CA that signed the master's; no other master is believed."
+        default=None, description="Certificates (PEM) of the CA that signed the master's; others are refused."
     )
     master_fingerprint: str | None = Field(
-        default=None, description="sha256 of the master's certificate; no master with another one is believed."
+        default=None, description="sha256 of the master's certificate; masters with another one are refused."
     )
     token: SecretStr | None = Field(default=None, description="The units' token itself ...")
     token_file: Path | None = Field(default=None, description="... or the file that holds it.")
@@ -101,17 +101,17 @@ class UnitConfig(Configured):
     jit_cache_dir: Path | None = Field(default=None, description="For compiled kernels.")
     source_address: str | None = Field(default=None, description="Own IP address to connect from.")
     T_world_camera: PoseConfig | None = Field(
-        default=None, description="The camera's pose, told to a master that has none for this unit."
+        default=None, description="The camera's pose, sent to a master that has none for this unit."
     )
     localise: bool = Field(
-        default=True, description="Look for the cell's board while nobody knows the camera's pose; else when asked."
+        default=True, description="Look for the cell's board while the pose is unknown; else only on command."
     )
-    board_stream: ImageStream = Field(default="infrared", description="In which the board is looked for, or color.")
+    board_stream: ImageStream = Field(default="infrared", description="Stream to find the board in, or color.")
     learn_background_frames: int = Field(
-        default=0, ge=0, le=10_000, description="Learn the empty cell from so many frames, unless it is known already."
+        default=0, ge=0, le=10_000, description="Frames to learn the empty cell from, if it was not learned before."
     )
-    fps_max: float | None = Field(default=None, gt=0.0, le=MAX_FPS, description="Frames beyond are passed over.")
-    trace_path: Path | None = Field(default=None, description="Where each frame's result is written, for evaluation.")
+    fps_max: float | None = Field(default=None, gt=0.0, le=MAX_FPS, description="Frames beyond are dropped.")
+    trace_path: Path | None = Field(default=None, description="File for the result of each frame, for evaluation.")
 
     @field_validator("source_address")
     @classmethod
@@ -141,11 +141,11 @@ class UnitConfig(Configured):
 
     @property
     def checks_master(self) -> bool:
-        """Whether the token goes to one master only, known by its certificate."""
+        """True if the token goes to one master only, known by its certificate."""
         return self.master_ca is not None or self.master_fingerprint is not None
 
     def tls(self) -> ssl.SSLContext | None:
-        """What is asked of the master's certificate; None leaves it to the CAs of the system.
+        """Return the TLS settings for the master's certificate; None leaves the check to the CAs of the system.
 
         Raises:
             ConfigError: `master_ca` cannot be read or holds no certificate.
@@ -153,10 +153,10 @@ class UnitConfig(Configured):
         return tls_context(self.master_ca, self.master_fingerprint) if self.checks_master else None
 
     def read_token(self) -> str:
-        """The units' token, read anew each time, so that it can be replaced while the unit runs.
+        """Read the units' token, at each call anew, so that it can be replaced while the unit runs.
 
         Raises:
-            ConfigError: there is none, or its file cannot be read.
+            ConfigError: no token is configured, or its file cannot be read.
         """
         if self.token is not None:
             where, token = "token", self.token.get_secret_value()

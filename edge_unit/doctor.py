@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`edge-unit doctor`: is all there that a unit needs, and if not, what is to be done; for a person with a board.
+"""`edge-unit doctor`: checks all requirements of a unit, and prints remedies for a person with a board.
 
-Nothing is changed anywhere: the master is asked, but not registered at.
+It changes nothing: it queries the master, but does not register.
 """
 
 from __future__ import annotations
@@ -41,39 +41,39 @@ from shared.waiting import within
 Level = Literal["ok", "warning", "FAIL"]
 
 MEASURE_S = 3.0
-"""Long enough for the rate of frames to be told to a few per cent."""
+"""Long enough to measure the frame rate to a few per cent."""
 
 KEPT_FRAMES = 10
-"""Of those measured, for the pipeline to work on."""
+"""Number of the measured frames that the pipeline processes."""
 
 RATE_OK, RATE_POOR = 0.9, 0.5
-"""Shares of the wanted rate."""
+"""Shares of the configured rate."""
 
 VALID_OK = 0.3
-"""Share of pixels that measure anything; a camera that looks into a cell has twice that."""
+"""Share of measured pixels; a camera that looks into a cell has twice that."""
 
 BUDGET_OK = 0.7
-"""Share of a frame's period that processing it may take, so that the rest of the board has air."""
+"""Share of a frame's period that processing may take, so that the board keeps a reserve."""
 
 ROUND_TRIP_OK_MS = 20.0
-"""Half of it is how far the robot's joints may be off in time: at 1 rad/s and 1 m reach, a centimetre."""
+"""Half of it is the time error of the robot's joints: at 1 rad/s and 1 m reach, a centimetre."""
 
 LISTEN_S = 2.0
-"""For masters to be heard of; they answer within a fifth of a second."""
+"""Time to hear announcements of masters; they answer within a fifth of a second."""
 
 SURVEY_S = 15.0
-"""For the SDK to look for cameras."""
+"""Time for the SDK to search for cameras."""
 
 NOBODY = 2**62
 """An id that no unit has."""
 
 EPOCH_NS = 1_735_689_600 * NS_PER_S
-"""2025-01-01: a clock that shows less was never set."""
+"""2025-01-01: a clock that shows an earlier date was never set."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report; `text` says what was found and, unless it is ok, what to do."""
+    """One line of the report; `text` is the result and, unless it is ok, the remedy."""
 
     level: Level
     what: str
@@ -85,7 +85,7 @@ class Finding:
 
 @dataclass
 class Measured:
-    """What a source delivered while it was watched."""
+    """Frames and ages that a source delivered during the check."""
 
     numbers: list[int] = field(default_factory=list)
     captured_ns: list[int] = field(default_factory=list)
@@ -94,13 +94,13 @@ class Measured:
 
     @property
     def fps(self) -> float:
-        """Frames that the camera took in a second, those included that were passed over."""
+        """Frames that the camera took in a second, including dropped ones."""
         span_ns = self.captured_ns[-1] - self.captured_ns[0] if self.captured_ns else 0
         return (self.numbers[-1] - self.numbers[0]) * NS_PER_S / span_ns if span_ns > 0 else 0.0
 
 
 async def examine(config: UnitConfig, seconds: float = MEASURE_S) -> AsyncIterator[Finding]:
-    """Look at one thing after the other, each as soon as it is known."""
+    """Yield the result of one check after the other, each as soon as it is known."""
     yield await asyncio.to_thread(software)
     yield clock()
     cell: Cell | None = None
@@ -145,13 +145,13 @@ async def examine(config: UnitConfig, seconds: float = MEASURE_S) -> AsyncIterat
 
 
 def software() -> Finding:
-    """What runs here."""
+    """Report the software versions."""
     version = importlib.metadata.version("cellwatch")
     return Finding("ok", "software", f"cellwatch {version}, Python {platform.python_version()}, {platform.machine()}")
 
 
 def clock() -> Finding:
-    """The wall clock, which people read in logs; units and master count by clocks that are never set."""
+    """Check the wall clock, which logs show; units and master use clocks that are never set."""
     if wall_ns() < EPOCH_NS:
         return Finding("warning", "clock", "it was never set, so the times in logs are wrong; start an NTP service")
     if not clock_is_set():
@@ -160,7 +160,7 @@ def clock() -> Finding:
 
 
 def stream(info: CameraInfo, measured: Measured, wanted_fps: float | None) -> Iterator[Finding]:
-    """What a camera delivers."""
+    """Check the frames of a camera."""
     lens = info.intrinsics
     if len(measured.numbers) < 2:
         yield Finding("FAIL", "stream", f"{info.model} {info.serial} was opened and delivered no frames")
@@ -183,7 +183,7 @@ def stream(info: CameraInfo, measured: Measured, wanted_fps: float | None) -> It
 
 
 async def _network(config: UnitConfig) -> AsyncIterator[Finding | Place]:
-    """The masters that are announced, what speaks against each, and where a unit would turn to."""
+    """List the announced masters, the objection to each, and the unit's choice."""
     try:
         tls = await asyncio.to_thread(config.tls) or tls_context()
     except ConfigError as error:
@@ -209,7 +209,7 @@ async def _network(config: UnitConfig) -> AsyncIterator[Finding | Place]:
 
 
 async def _master(config: UnitConfig, place: Place) -> AsyncIterator[Finding | Cell]:
-    """Whether the master is there and takes our token; the cell that it watches, if it gives it."""
+    """Check that the master answers and accepts the token; returns its cell, if it gives it."""
     try:
         tls = await asyncio.to_thread(config.tls)
         client = MasterClient(place.url, config.read_token, config.source_address, tls=tls)
@@ -255,7 +255,7 @@ async def _master(config: UnitConfig, place: Place) -> AsyncIterator[Finding | C
 
 
 async def _token(client: MasterClient) -> Finding:
-    """Whether the token is a unit's: an update of a unit that does not exist is refused for that reason, or another."""
+    """Check that the token is a unit's: an update of a non-existent unit is refused for that reason, or another."""
     update = UpdateRequest(id=NOBODY, session=0, sequence=0, sent_at_ns=monotonic_ns(), versions=Versions())
     try:
         await client.update(update)
@@ -269,7 +269,7 @@ async def _token(client: MasterClient) -> Finding:
 
 
 async def _cameras(source: RealsenseSourceConfig) -> AsyncIterator[Finding]:
-    """The SDK, and the cameras that it sees."""
+    """Check the SDK, and list its cameras."""
     try:
         found = await _survey()
     except SourceError as error:
@@ -316,7 +316,7 @@ def _no_camera(on_usb: list[str]) -> str:
 
 
 async def _survey() -> link.Found:
-    """What the SDK sees.
+    """List the SDK's cameras.
 
     Raises:
         SourceError: it cannot be loaded, or does not answer.
@@ -339,7 +339,7 @@ async def _survey() -> link.Found:
 
 
 def _source(config: UnitConfig) -> tuple[DepthSource, Path]:
-    """The source, and where compiled kernels are kept: that is settled before the first of them is imported."""
+    """Make the source and settle the cache of compiled kernels, before the first kernel is imported."""
     settled = settle(config.jit_cache_dir)
     from edge_unit.source_factory import make_source
 
@@ -360,7 +360,7 @@ def _note(measured: Measured, frame: DepthFrame) -> None:
 
 
 def _wanted_fps(camera: DepthSource, config: UnitConfig) -> float | None:
-    """The rate that is asked for; None where frames come as fast as they are taken."""
+    """Return the configured rate; None if frames come as fast as they are taken."""
     if isinstance(camera, RealsenseSource):
         recorded = isinstance(config.source, RealsenseSourceConfig) and config.source.recording is not None
         return None if recorded or camera.opened is None else float(camera.opened.fps)
@@ -375,7 +375,7 @@ def _pipeline(
     wanted_fps: float | None,
     settled: Path,
 ) -> Iterator[Finding]:
-    """Kernels and what a frame costs, with the frames that were measured and a robot that stands elsewhere in each."""
+    """Measure the kernels and the cost of a frame, with the measured frames and the robot in another pose for each."""
     from edge_unit.pipeline import DepthPipeline
     from geometry.kernels.points import count_foreground
 
@@ -401,7 +401,7 @@ def _pipeline(
     if cost_ms <= BUDGET_OK * budget_ms:
         findings.append(Finding("ok", "pipeline", f"{text}, of {budget_ms:.0f} ms between frames"))
     else:
-        advice = "frames will be passed over; use a smaller picture, a lower fps or larger voxels"
+        advice = "frames will be dropped; use a smaller image, a lower fps or larger voxels"
         findings.append(Finding("warning", "pipeline", f"{text}, with {budget_ms:.0f} ms between frames: {advice}"))
     return iter(findings)
 
@@ -417,7 +417,7 @@ def _kernels(settled: Path, ready_s: float, *, compiled: bool) -> Finding:
 
 
 def _pose(config: UnitConfig, info: CameraInfo, cell: Cell) -> Transform:
-    """Where the camera stands, or, where nobody knows, above the cell looking down."""
+    """Return the camera's pose or, if it is not known, a pose above the cell that looks down."""
     if config.T_world_camera is not None:
         return config.T_world_camera.transform()
     if info.T_world_camera is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The source that the configuration names, made by what is registered for its kind."""
+"""Makes the configured source, by the factory registered for its kind."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edge_unit.sources.simulated import SimulatedSource, SimulatedSourceConfig
 from shared.errors import ConfigError
 
 SourceFactories = Mapping[type[SourceConfig], Callable[[Any], DepthSource]]
-"""What makes the source of each type of configuration."""
+"""Factories by type of configuration."""
 
 FACTORIES: SourceFactories = MappingProxyType(
     {
@@ -24,14 +24,14 @@ FACTORIES: SourceFactories = MappingProxyType(
         SimulatedSourceConfig: SimulatedSource,
     }
 )
-"""Those of the product. Whoever puts other hardware behind the same configuration hands over factories of its own."""
+"""The product's own factories. To put other hardware behind the same configuration, pass factories of your own."""
 
 
 def make_source(config: SourceConfig, factories: SourceFactories = FACTORIES) -> DepthSource:
-    """Make the source that the configuration names.
+    """Make the configured source.
 
     Raises:
-        ConfigError: nothing is registered for its kind.
+        ConfigError: no factory is registered for its kind.
     """
     factory = factories.get(type(config))
     if factory is None:
@@ -41,7 +41,7 @@ def make_source(config: SourceConfig, factories: SourceFactories = FACTORIES) ->
 
 
 def is_recording(config: SourceConfig) -> bool:
-    """Return True for a source that will not get better by itself: a file stays as it is."""
+    """Return True for a source that does not recover by itself: a file stays as it is."""
     if isinstance(config, RealsenseSourceConfig):
         return config.recording is not None
     return isinstance(config, RecordedSourceConfig)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which master a unit believes: one with a certificate of the configured CA, or with one certificate and no other.
+"""Trust in a master: by a certificate of the configured CA, or by one pinned certificate.
 
-Both are checked while the connection is made, so before any request, and the token in it, goes out.
+Both are checked during the handshake, before any request, and its token, is sent.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ FINGERPRINT_HEX = 64
 
 
 def normalised(fingerprint: str) -> str:
-    """A certificate's sha256 as 64 small hexadecimal digits; openssl writes it in capitals with colons.
+    """Return a certificate's sha256 as 64 small hexadecimal digits; openssl writes it in capitals with colons.
 
     Raises:
-        ValueError: it is no sha256.
+        ValueError: it is not a sha256.
     """
     digits = fingerprint.replace(":", "").strip().lower()
     if len(digits) != FINGERPRINT_HEX or not set(digits) <= set("0123456789abcdef"):
@@ -30,11 +30,11 @@ def normalised(fingerprint: str) -> str:
 
 
 def tls_context(ca: Path | None = None, fingerprint: str | None = None) -> ssl.SSLContext:
-    """What is asked of the master's certificate.
+    """Return the TLS context that checks the master's certificate.
 
     With `ca`, a file of PEM certificates, one of these must have signed it, for the host of `master_url`. With
-    `fingerprint` (normalised) it must be that very certificate, whoever signed it and for whatever host. With both,
-    both; with neither, the CAs of the system decide.
+    `fingerprint` (normalised) it must be exactly that certificate, with any signer and host. With both, both checks
+    apply; with neither, the CAs of the system decide.
 
     Raises:
         ConfigError: `ca` cannot be read or holds no certificate.
@@ -56,7 +56,7 @@ def tls_context(ca: Path | None = None, fingerprint: str | None = None) -> ssl.S
 
 def _pinned(fingerprint: str) -> type[ssl.SSLObject]:
     class PinnedObject(ssl.SSLObject):
-        """A connection whose handshake fails unless the certificate is the one expected."""
+        """An SSL object whose handshake fails unless the certificate is the expected one."""
 
         def do_handshake(self) -> None:
             super().do_handshake()

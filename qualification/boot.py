@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make rehearsal`: three units and a master as machines that boot, fail and come back, without a board.
+"""`make rehearsal`: boot, break and recover three units and a master as machines, without a board.
 
 Each machine is a container with systemd, the services of `deploy/systemd` and the root file system that
-`deploy/image/customize-rootfs` made, the three units from the very same one. Measured are the seconds from switching
-a unit on to its first merged voxel, with kernels that its image carries and without, and how long each fault keeps a
-unit from being live. Prints the table, and at the end all of it as one line of JSON; exits with 1 when a mark is
-missed. Needs root.
+`deploy/image/customize-rootfs` made; the three units share the same one. The command measures the seconds from power-on
+of a unit to its first merged voxel, with the kernels that its image carries and without, and the time for which each
+fault keeps a unit from being live. It prints the table and, at the end, all figures as one line of JSON. The exit code
+is 1 when a mark is missed. Needs root.
 """
 
 from __future__ import annotations
@@ -36,28 +36,30 @@ from shared.errors import CellwatchError, ConfigError
 from simulation.fleet.processes import raise_when_stopped
 
 ROOTS = Path("out/rehearsal")
-"""Where `deploy/image/rehearsal-roots` leaves them."""
+"""Folder to which `deploy/image/rehearsal-roots` writes."""
 
 MASTER_IP, MASTER_URL = "10.77.0.1", "http://10.77.0.1:8420"
 
 UNIT, MASTER = "edge-unit.service", "master-server.service"
 
 FIRST_S_MAX, WARM_S_MAX = 10.0, 5.0
-"""From switching on to the first voxel: at a board's first boot, its own cache empty, and at later ones."""
+"""From power-on to the first voxel: at the first boot of a board, with an empty cache, and at later ones."""
 
 WATCHDOG_S = 10.0
-"""As in the unit files."""
+"""The value in the unit files."""
 
 RESTART_S_MAX = 8.0
-"""For systemd to start a service again, a second of waiting included, and for a unit to be live, kernels compiled."""
+"""Time for systemd to restart a service, including a second of waiting, and for a unit with compiled kernels to be
+live.
+"""
 
 UNITS = 3
 
 BOOT_S_MAX = 400.0
-"""Until it is given up: a unit that compiles everything on a very busy computer."""
+"""Timeout of a boot: a unit that compiles everything on a very busy computer."""
 
 FULL_BYTES = 64 * 1024 * 1024
-"""The size of a disk that is filled; state and settings of a unit take a hundredth."""
+"""Size of a disk that is filled. State and settings of a unit take a hundredth of it."""
 
 HANGING_SERVICE = """
 [Service]
@@ -68,7 +70,7 @@ ExecStart=/usr/bin/python3 /opt/hanging-unit/hanging_unit.py
 
 @dataclass
 class Site:
-    """A master, three units, and who asks after them."""
+    """A master, three units, and a client that polls their states."""
 
     master: Machine
     units: list[Machine]
@@ -76,7 +78,7 @@ class Site:
     rows: list[dict[str, Any]] = field(default_factory=list)
 
     def states(self) -> dict[str, dict[str, Any]]:
-        """A row a unit by its address; none while the master does not answer."""
+        """Return one row per unit by its address; empty if the master does not answer."""
         try:
             answer = self.operator.get("/units")
         except httpx.HTTPError:
@@ -84,12 +86,12 @@ class Site:
         return {row["ip"]: row for row in answer.json()} if answer.status_code == 200 else {}
 
     def live(self, unit: Machine) -> bool:
-        """Whether the master takes the unit's view for good, and it has reported a voxel."""
+        """Return True if the master has the unit live, and the unit has reported a voxel."""
         row = self.states().get(unit.ip)
         return row is not None and row["state"] == "live" and row["voxels"] > 0
 
     def until_live(self, unit: Machine, timeout_s: float = BOOT_S_MAX) -> int:
-        """When it was."""
+        """Wait until the unit is live, and return the time."""
         try:
             until(lambda: self.live(unit), f"{unit.name} live", timeout_s)
         except MachineError as error:
@@ -97,7 +99,7 @@ class Site:
         return monotonic_ns()
 
     def until_not_live(self, unit: Machine) -> None:
-        """Until the master has noticed."""
+        """Wait until the master has noticed that the unit is not live."""
         until(lambda: not self.live(unit), f"{unit.name} not live any more", BOOT_S_MAX)
 
 
@@ -105,7 +107,7 @@ class Site:
 
 
 def switch_on(site: Site) -> dict[str, Any]:
-    """Units alone, as a board of its own would be: with the kernels that its image carries, again, and without any."""
+    """Boot one unit like a board by itself: with the kernels of its image, again, and without any."""
     unit, bare = site.units[0], site.units[-1]
     carried_s = _first_voxel_s(site, unit)
     compiled = unit.run("find", "/var/cache/private", "-name", "*.nbc", "-type", "f").split()
@@ -126,7 +128,7 @@ def _first_voxel_s(site: Site, unit: Machine) -> float:
 
 
 def join(site: Site) -> dict[str, Any]:
-    """The others, from the same root file system; every machine must have made a name of its own."""
+    """Boot the other units from the same root file system. Every machine must generate its own name."""
     for unit in site.units[1:-1]:
         unit.power_on()
     for unit in site.units[1:]:
@@ -150,7 +152,7 @@ def join(site: Site) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Fault:
-    """`strike` makes it happen; what it returns takes it away again, and the time counts from then on."""
+    """`strike` causes the fault. It may return a function that ends it; the time counts from then on."""
 
     name: str
     what: str
@@ -160,17 +162,17 @@ class Fault:
 
 
 def unit_crashes(site: Site) -> None:
-    """The kernel ends the process."""
+    """The kernel kills the process."""
     site.units[0].kill(UNIT, signal.SIGSEGV)
 
 
 def unit_stands_still(site: Site) -> None:
-    """The process gets no turn any more, as one that waits for a dead disk."""
+    """The process gets no CPU, like one that waits for a dead disk."""
     site.units[0].kill(UNIT, signal.SIGSTOP)
 
 
 def let_frames_hang(site: Site) -> None:
-    """Have the unit run as one that hangs when it is told to."""
+    """Install the unit variant that hangs on demand."""
     unit = site.units[0]
     drop_in = "/run/systemd/system/edge-unit.service.d"
     unit.run("sh", "-c", f"mkdir -p {drop_in} && cp /opt/hanging-unit/hang.conf {drop_in}/ && systemctl daemon-reload")
@@ -179,39 +181,39 @@ def let_frames_hang(site: Site) -> None:
 
 
 def frame_hangs(site: Site) -> None:
-    """The event loop runs and talks to the master, the thread that filters does not come back."""
+    """The event loop runs and talks to the master, but the filter thread does not return."""
     unit = site.units[0]
     pid = unit.show(UNIT, "MainPID")
-    # Its watchdog takes the process that hangs, and what hung it is gone when the next one begins.
+    # The watchdog kills the hanging process. The cause of the hang is gone when the next process starts.
     unit.run("touch", "/run/hang")
     until(lambda: unit.show(UNIT, "MainPID") != pid, "the watchdog", BOOT_S_MAX)
     unit.run("rm", "/run/hang")
 
 
 def master_crashes(site: Site) -> None:
-    """The kernel ends the process."""
+    """The kernel kills the process."""
     site.master.kill(MASTER, signal.SIGSEGV)
 
 
 def master_stands_still(site: Site) -> None:
-    """The process gets no turn any more."""
+    """The process gets no CPU."""
     site.master.kill(MASTER, signal.SIGSTOP)
 
 
 def master_loses_power(site: Site) -> Callable[[], object]:
-    """The whole machine is gone, longer than any unit's patience could be."""
+    """The whole machine is off, longer than the longest timeout of a unit."""
     site.master.cut_power()
     return site.master.power_on
 
 
 def unit_loses_power(site: Site) -> Callable[[], object]:
-    """The whole machine is gone."""
+    """The whole machine is off."""
     site.units[0].cut_power()
     return site.units[0].power_on
 
 
 def disk_is_full(site: Site) -> None:
-    """Not a byte is left for state or kernels, and the service is started again."""
+    """No byte is left for state or kernels, and the service is restarted."""
     unit = site.units[0]
     for folder in ("state", "cache"):
         disk = os.statvfs(unit.folder / folder)
@@ -239,7 +241,7 @@ FAULTS = (
 
 
 def strike(site: Site, fault: Fault) -> dict[str, Any]:
-    """One fault, from its beginning until the first unit is live again."""
+    """Run one fault, from its beginning until the first unit is live again."""
     unit = site.units[0]
     if fault.prepare is not None:
         fault.prepare(site)
@@ -260,7 +262,7 @@ def strike(site: Site, fault: Fault) -> dict[str, Any]:
 
 @contextmanager
 def site_of(roots: Path, folder: Path) -> Iterator[Site]:
-    """A master that runs, and three units that are not switched on yet."""
+    """Start a master, and prepare three units that are still off."""
     hanging = folder / "hanging-unit"
     hanging.mkdir()
     shutil.copy(hanging_unit.__file__, hanging)
@@ -269,7 +271,7 @@ def site_of(roots: Path, folder: Path) -> Iterator[Site]:
     nothing.mkdir()
     with ExitStack() as stack:
         master = stack.enter_context(Machine("master", roots / "master", MASTER_IP, folder / "master"))
-        # The token that the units' image carries was this master's.
+        # The token in the units' image is this master's.
         state = folder / "master" / "state" / "cellwatch-master"
         state.mkdir(mode=0o700)
         (state / "unit.token").write_text((roots / "unit.token").read_text())
@@ -286,7 +288,7 @@ def site_of(roots: Path, folder: Path) -> Iterator[Site]:
             (folder / name / "unit.yaml").write_text(config)
             binds = [f"{hanging}:/opt/hanging-unit", f"{folder / name}/unit.yaml:/etc/cellwatch/unit.yaml"]
             if number == UNITS - 1:
-                # This one's image carries no kernels.
+                # This unit's image carries no kernels.
                 release = (roots / "unit" / "opt" / "cellwatch" / "current").readlink()
                 binds.append(f"{nothing}:/opt/cellwatch/{release}/kernels")
             unit = Machine(name, roots / "unit", f"10.77.0.{11 + number}", folder / name, tuple(binds))
@@ -309,7 +311,7 @@ def _answers(operator: httpx.Client) -> bool:
 
 
 def rehearse(roots: Path, folder: Path, faults: Sequence[Fault]) -> dict[str, Any]:
-    """Switch on, strike with each fault, and tell what came of it."""
+    """Boot, run each fault, and return the figures."""
     make_network()
     with site_of(roots, folder) as site:
         document: dict[str, Any] = {"load": os.getloadavg()[0], "switch_on": switch_on(site)}
@@ -325,7 +327,7 @@ def rehearse(roots: Path, folder: Path, faults: Sequence[Fault]) -> dict[str, An
 
 
 def stop_s(unit: Machine) -> float:
-    """How long the service takes to stop in good order."""
+    """Return the seconds that the service takes to stop cleanly."""
     began_ns = monotonic_ns()
     unit.run("systemctl", "stop", UNIT)
     took_s = (monotonic_ns() - began_ns) / NS_PER_S
@@ -335,7 +337,7 @@ def stop_s(unit: Machine) -> float:
 
 
 def marks(document: dict[str, Any]) -> list[Mark]:
-    """What the figures are held against."""
+    """Return the marks."""
     on, joined = document["switch_on"], document["join"]
     return [
         Mark("seconds from power-on to the first voxel, first boot", on["carried_s"], at_most=FIRST_S_MAX),
@@ -350,7 +352,7 @@ def marks(document: dict[str, Any]) -> list[Mark]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run; exit code 1 when a mark is missed."""
+    """Run. The exit code is 1 when a mark is missed."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(arguments)
     try:
@@ -396,7 +398,7 @@ def _parser() -> argparse.ArgumentParser:
     names = [fault.name for fault in FAULTS]
     parser.add_argument("names", nargs="*", choices=[*names, []], metavar="NAME", help=", ".join(names))
     parser.add_argument("--roots", type=Path, default=ROOTS, help="root file systems (default: out/rehearsal)")
-    parser.add_argument("--no-results", action="store_true", help="leave out/results as it is")
+    parser.add_argument("--no-results", action="store_true", help="do not write out/results")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     return parser
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make faults`: what the map says while processes, clocks, networks and disks fail.
+"""`make faults`: test the map while processes, clocks, networks and disks fail.
 
-Each fault strikes a real master with two real units and a robot's controller. As it strikes, something comes to a
-place that only the unit in trouble can see; an observer asks for the map every 10 ms all the while, and no answer may
-call that place free once its last view has gone stale. Prints the table, and at the end all of it as one line of JSON;
-exits with 1 when a mark is missed. `ARGS="unit-killed"` tries one by name.
+Each fault hits a real master with two real units and a robot's controller. At that moment a thing appears in a place
+that only the affected unit can see. An observer polls the map every 10 ms, and no answer may call that place free once
+its last view is stale. The command prints the table and, at the end, all figures as one line of JSON. The exit code is
+1 when a mark is missed. `ARGS="unit-killed"` runs one fault by name.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from simulation.fleet.fleet import MASTER_PREFIX
 from simulation.fleet.processes import Processes
 
 HOLD_S = 1.5
-"""A fault lasts this long after it could be noticed: long enough for retries to be at their slowest."""
+"""Duration of a fault after it is noticeable: long enough for retries to reach their longest back-off."""
 
 FIRST, SECOND = 0, 1
 
@@ -55,11 +55,11 @@ TMPFS_BYTES = 2**20
 
 @dataclass
 class Course:
-    """When a fault began and ended, and what else is to be told of it."""
+    """Times of a fault's begin and end, and notes on it."""
 
     cause_ns: int = 0
     noticeable_ns: int = 0
-    """Where that is not when it began."""
+    """Set if it differs from the begin of the fault."""
     gone_ns: int = 0
     lost: list[str] = field(default_factory=list)
     figures: dict[str, float | str] = field(default_factory=dict)
@@ -67,7 +67,7 @@ class Course:
 
 @dataclass(frozen=True)
 class Fault:
-    """`names` is what the map's reason must name; None: there is nothing to notice, the map stays good."""
+    """`names` must stand in the map's reason. None: there is nothing to notice, and the map stays good."""
 
     name: str
     what: str
@@ -77,12 +77,12 @@ class Fault:
 
 
 async def hold(seconds: float = HOLD_S) -> None:
-    """Let it last."""
+    """Keep the fault for this time."""
     await asyncio.sleep(NOTICED_S_MAX + seconds)
 
 
 async def ordinary(site: Site) -> None:
-    """All on this machine, one address each."""
+    """Start all processes on this machine, each with an address of its own."""
     await site.start_master()
     await site.start_robot()
     for index in (FIRST, SECOND):
@@ -91,12 +91,12 @@ async def ordinary(site: Site) -> None:
 
 
 def begin(course: Course) -> None:
-    """Now it strikes."""
+    """Record the begin of the fault."""
     course.cause_ns = monotonic_ns()
 
 
 async def again(site: Site, course: Course, **how: Any) -> None:
-    """Start the first unit again; the cause is gone when it has registered."""
+    """Start the first unit again. The cause is gone when the unit has registered."""
     started_ns = monotonic_ns()
     unit = await site.start_unit(FIRST, **how)
     await until(lambda: registered(unit), "the unit registers again")
@@ -108,7 +108,7 @@ async def again(site: Site, course: Course, **how: Any) -> None:
 
 
 async def unit_killed(site: Site, course: Course, **how: Any) -> None:
-    """A unit is killed while something comes before it, and started again as `how` says."""
+    """Kill a unit while a thing appears before it, and start it again with `how`."""
     await ordinary(site)
     begin(course)
     await site.kill(site.units[FIRST])
@@ -119,7 +119,7 @@ async def unit_killed(site: Site, course: Course, **how: Any) -> None:
 
 
 async def unit_frozen(site: Site, course: Course) -> None:
-    """A unit stands still, and must not show afterwards what it had in hand."""
+    """Stop a unit. After it continues, it must not report its old frame."""
     await ordinary(site)
     begin(course)
     site.units[FIRST].process.send_signal(signal.SIGSTOP)
@@ -131,7 +131,7 @@ async def unit_frozen(site: Site, course: Course) -> None:
 
 
 async def robot_silent(site: Site, course: Course) -> None:
-    """The robot's controller stands still."""
+    """Stop the robot's controller."""
     await ordinary(site)
     begin(course)
     site.robot.process.send_signal(signal.SIGSTOP)
@@ -143,7 +143,7 @@ async def robot_silent(site: Site, course: Course) -> None:
 
 
 async def master_killed(site: Site, course: Course) -> None:
-    """The master is killed, and comes back at the same port."""
+    """Kill the master, and start it again at the same port."""
     await ordinary(site)
     begin(course)
     await site.kill(site.master)
@@ -155,14 +155,14 @@ async def master_killed(site: Site, course: Course) -> None:
 
 
 async def camera_died_meanwhile(site: Site, course: Course) -> None:
-    """The master is killed, and while nobody asks, so is a unit."""
+    """Kill the master, and kill a unit while the master is down."""
     await ordinary(site)
     begin(course)
     await site.kill(site.master)
     await site.kill(site.units[FIRST])
     site.newcomer()
     await site.start_master()
-    # From here on it can be asked, and must miss the camera.
+    # From here on the master answers, and must report the camera as missing.
     course.noticeable_ns = monotonic_ns()
     await hold()
     await again(site, course)
@@ -173,7 +173,7 @@ async def camera_died_meanwhile(site: Site, course: Course) -> None:
 
 
 def wall_clock(index: int | None, by_s: int) -> Callable[[Site, Course], Awaitable[None]]:
-    """The wall clock of a unit (None: of the master) jumps."""
+    """Return a fault: the wall clock of a unit (None: of the master) jumps."""
 
     async def strike(site: Site, course: Course) -> None:
         clock = WallClock(site.folder / "clock")
@@ -193,7 +193,7 @@ def wall_clock(index: int | None, by_s: int) -> Callable[[Site, Course], Awaitab
 
 
 def monotonic_clock(by_s: int) -> Callable[[Site, Course], Awaitable[None]]:
-    """A unit is started again, and its monotonic clock begins elsewhere, as that of another board."""
+    """Return a fault: a unit restarts with another origin of its monotonic clock, like that of another board."""
     return partial(unit_killed, under=monotonic_elsewhere(by_s))
 
 
@@ -201,7 +201,7 @@ def monotonic_clock(by_s: int) -> Callable[[Site, Course], Awaitable[None]]:
 
 
 async def network_cut(site: Site, course: Course) -> None:
-    """A unit in a network namespace of its own loses its cable."""
+    """Pull the cable of a unit in its own network namespace."""
     cable = Cable()
     try:
         site.host = "0.0.0.0"
@@ -222,7 +222,7 @@ async def network_cut(site: Site, course: Course) -> None:
 
 
 async def by_proxy(site: Site) -> Proxy:
-    """The first unit reaches the master through a proxy."""
+    """Start the units so that the first one reaches the master through a proxy."""
     await site.start_master()
     proxy = Proxy(site.port, ADDRESSES[FIRST])
     await proxy.open()
@@ -234,14 +234,14 @@ async def by_proxy(site: Site) -> Proxy:
 
 
 async def network_slow(site: Site, course: Course) -> None:
-    """What it sends is 150 to 250 ms under way."""
+    """Delay all data of a unit by 150 to 250 ms."""
     proxy = await by_proxy(site)
     try:
         begin(course)
         proxy.delay_s, proxy.jitter_s = 0.2, 0.05
         site.newcomer()
         await hold(2.0 * HOLD_S)
-        ages = [a.age_s for a in site.asker.answers if a.age_s is not None and a.got_ns > course.cause_ns]
+        ages = [a.age_s for a in site.poller.answers if a.age_s is not None and a.got_ns > course.cause_ns]
         course.figures["oldest_view_s_max"] = max(ages)
         course.gone_ns = monotonic_ns()
         proxy.delay_s = proxy.jitter_s = 0.0
@@ -251,7 +251,7 @@ async def network_slow(site: Site, course: Course) -> None:
 
 
 async def connections_cut(site: Site, course: Course) -> None:
-    """Every connection of a unit is reset, three times a second."""
+    """Reset every connection of a unit, three times a second."""
     proxy = await by_proxy(site)
     try:
         begin(course)
@@ -267,7 +267,7 @@ async def connections_cut(site: Site, course: Course) -> None:
 
 
 def replayed(path: str) -> Callable[[Site, Course], Awaitable[None]]:
-    """What a unit sent before is sent again from its own address."""
+    """Return a fault: an earlier request of a unit is sent again from its own address."""
 
     async def strike(site: Site, course: Course) -> None:
         proxy = await by_proxy(site)
@@ -290,7 +290,7 @@ def replayed(path: str) -> Callable[[Site, Course], Awaitable[None]]:
 
 
 async def send_again(request: bytes, port: int) -> str:
-    """The status that the bytes of a request are answered with, sent from the first unit's address."""
+    """Send the bytes of a request from the first unit's address, and return the status of the answer."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port, local_addr=(ADDRESSES[FIRST], 0))
     writer.write(request)
     status = (await reader.readline()).split()[1].decode()
@@ -304,14 +304,14 @@ async def send_again(request: bytes, port: int) -> str:
 
 
 def tmpfs(folder: Path) -> Path:
-    """A tiny disk at `folder`, in our own mount namespace."""
+    """Mount a tiny disk at `folder`, in a private mount namespace."""
     folder.mkdir(parents=True, exist_ok=True)
     run("mount", "-t", "tmpfs", "-o", f"size={TMPFS_BYTES}", "tmpfs", str(folder))
     return folder
 
 
 def fill(folder: Path) -> Path:
-    """Write until nothing goes any more; returns the file that takes all the room."""
+    """Write until the disk is full. Return the file that takes all the space."""
     path = folder / "full"
     with path.open("wb", buffering=0) as file:
         try:
@@ -324,7 +324,7 @@ def fill(folder: Path) -> Path:
 
 
 async def master_disk_full(site: Site, course: Course) -> None:
-    """While it is full an operator changes a setting; when there is room again the master is killed and restarted."""
+    """Change a setting while the disk is full; after space is free again, kill and restart the master."""
     disk = tmpfs(site.master_state)
     try:
         await ordinary(site)
@@ -339,8 +339,8 @@ async def master_disk_full(site: Site, course: Course) -> None:
         course.gone_ns = monotonic_ns()
         full.unlink()
         await site.settled()
-        # What was acknowledged must be there after a crash, too.
-        await site.look_away()
+        # What was acknowledged must survive a crash, too.
+        await site.stop_observers()
         await site.kill(site.master)
         await site.start_master()
         course.lost = await site.lost()
@@ -349,7 +349,7 @@ async def master_disk_full(site: Site, course: Course) -> None:
 
 
 async def unit_disk_full(site: Site, course: Course) -> None:
-    """A unit whose disk is full from the start is killed and started again."""
+    """Kill and restart a unit whose disk is full from the start."""
     disk = tmpfs(site.state_dirs[FIRST])
     try:
         fill(disk)
@@ -368,30 +368,30 @@ async def unit_disk_full(site: Site, course: Course) -> None:
 
 
 async def units_swapped(site: Site, course: Course) -> None:
-    """Both units are started again with each other's address; then an operator tells where the cameras are."""
+    """Restart both units with each other's address; then an operator sets the poses of the cameras."""
     await swap_addresses(site, course)
     for unit in [await site.start_unit(index) for index in (FIRST, SECOND)]:
         await until(partial(registered, unit), "the swapped units register")
     await hold()
     course.gone_ns = monotonic_ns()
-    await tell_poses(site)
+    await set_and_expect_poses(site)
 
 
 async def address_taken(site: Site, course: Course) -> None:
-    """The first unit comes back with the address of the second, which is gone for now; an operator tells its pose."""
+    """Restart the first unit with the address of the second, which is off; then an operator sets its pose."""
     await swap_addresses(site, course)
     unit = await site.start_unit(FIRST)
     await until(partial(registered, unit), "the unit registers with the other's address")
-    await site.give_poses()
+    await site.set_poses()
     await hold()
     unit = await site.start_unit(SECOND)
     await until(partial(registered, unit), "the other unit registers")
     course.gone_ns = monotonic_ns()
-    await tell_poses(site)
+    await set_and_expect_poses(site)
 
 
 async def swap_addresses(site: Site, course: Course) -> None:
-    """Both units are killed; whichever is started again has the other's address."""
+    """Kill both units. Each restart then uses the other's address."""
     await ordinary(site)
     begin(course)
     for unit in site.units:
@@ -400,9 +400,9 @@ async def swap_addresses(site: Site, course: Course) -> None:
     site.addresses.reverse()
 
 
-async def tell_poses(site: Site) -> None:
-    """An operator tells where the cameras are, which the master is to keep from now on."""
-    await site.give_poses()
+async def set_and_expect_poses(site: Site) -> None:
+    """Set the poses of the cameras as an operator. The master must keep them from now on."""
+    await site.set_poses()
     acknowledged = await site.acknowledged()
     for serial in SERIALS:
         site.expect(serial, acknowledged[serial])
@@ -410,7 +410,7 @@ async def tell_poses(site: Site) -> None:
 
 
 async def token_revoked(site: Site, course: Course) -> None:
-    """The units' token is replaced at the master and at the second unit; the first one learns it later."""
+    """Replace the units' token at the master and at the second unit. The first unit gets it later."""
     await ordinary(site)
     token = "another-token-of-the-units-0123456789abcdef"
     replace(site.tokens[SECOND], token)
@@ -424,7 +424,7 @@ async def token_revoked(site: Site, course: Course) -> None:
 
 
 def replace(path: Path, text: str) -> None:
-    """Write a file whole."""
+    """Write a file atomically."""
     written = path.with_suffix(".new")
     written.write_text(text + "\n")
     written.chmod(0o600)
@@ -435,13 +435,13 @@ ONE = f"({ADDRESSES[FIRST]})"
 
 FAULTS: tuple[Fault, ...] = (
     Fault("unit-killed", "a unit is killed and started again", ONE, unit_killed),
-    Fault("unit-frozen", "a unit stands still (SIGSTOP, SIGCONT)", ONE, unit_frozen),
+    Fault("unit-frozen", "a unit is stopped (SIGSTOP, SIGCONT)", ONE, unit_frozen),
     Fault("wall-clock-ahead", "a unit's wall clock jumps 1 h ahead", None, wall_clock(FIRST, HOUR_S), False),
     Fault("wall-clock-back", "a unit's wall clock jumps 1 h back", None, wall_clock(FIRST, -HOUR_S), False),
     Fault("master-wall-clock", "the master's wall clock jumps 1 h back", None, wall_clock(None, -HOUR_S), False),
     Fault("monotonic-elsewhere", "a unit's monotonic clock starts 11 days ahead", ONE, monotonic_clock(10**6)),
     Fault("network-cut", "a unit's network cable is pulled, and plugged in", f"({UNIT_IP})", network_cut),
-    Fault("network-slow", "what a unit sends is 200 ms (+-50) under way", None, network_slow, False),
+    Fault("network-slow", "a unit's data is delayed by 200 ms (+-50)", None, network_slow, False),
     Fault("connections-cut", "a unit's connections are reset, 3 times a second", None, connections_cut, False),
     Fault("master-killed", "the master is killed and started again", "", master_killed),
     Fault("camera-died-meanwhile", "... and a unit dies while it is down", ONE, camera_died_meanwhile),
@@ -457,10 +457,10 @@ FAULTS: tuple[Fault, ...] = (
 
 
 async def strike(fault: Fault) -> dict[str, Any]:
-    """One fault from the first process to the last; its row.
+    """Run one fault from the first process to the last, and return its row.
 
     Raises:
-        CellwatchError: it could not be measured.
+        CellwatchError: the fault could not be measured.
     """
     folder = Path(tempfile.mkdtemp(prefix="cellwatch-faults-"))
     try:
@@ -476,14 +476,14 @@ async def strike(fault: Fault) -> dict[str, Any]:
                 trouble = str(error)
                 course.lost = course.lost or await site.lost()
             finally:
-                await site.look_away()
+                await site.stop_observers()
             return row(fault, site, course, trouble)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def row(fault: Fault, site: Site, course: Course, trouble: str) -> dict[str, Any]:
-    """What is told of a fault."""
+    """Return the row of a fault."""
     polled, streamed = (
         judge(
             answers,
@@ -495,7 +495,7 @@ def row(fault: Fault, site: Site, course: Course, trouble: str) -> dict[str, Any
             fault.blind,
             len(SERIALS),
         )
-        for answers in (site.asker.answers, in_force(site.listener.answers))
+        for answers in (site.poller.answers, in_force(site.subscriber.answers))
     )
     false = polled.false_free or (streamed.false_free and f"stream: {streamed.false_free}")
     return {
@@ -509,8 +509,8 @@ def row(fault: Fault, site: Site, course: Course, trouble: str) -> dict[str, Any
         "stream_noticed_s": _rounded(streamed.noticed_s),
         "stream_recovered_s": _rounded(streamed.recovered_s),
         "complete_share": round(polled.complete_share, 3),
-        "answers": len(site.asker.answers),
-        "messages": len(site.listener.answers),
+        "answers": len(site.poller.answers),
+        "messages": len(site.subscriber.answers),
         **{name: _rounded(value) if isinstance(value, float) else value for name, value in course.figures.items()},
         **({"first_false": false} if false else {}),
         **({"forgotten": course.lost} if course.lost else {}),
@@ -519,7 +519,7 @@ def row(fault: Fault, site: Site, course: Course, trouble: str) -> dict[str, Any
 
 
 def met(fault: Fault, verdict: Verdict, lost: Sequence[str]) -> bool:
-    """Whether all marks are met."""
+    """Return True if all marks are met."""
     noticed = fault.names is None or (verdict.noticed_s is not None and verdict.noticed_s <= NOTICED_S_MAX)
     recovered = verdict.recovered_s is not None and verdict.recovered_s <= RECOVERED_S_MAX
     return noticed and recovered and not verdict.false_free and not lost
@@ -530,7 +530,7 @@ def _rounded(value: float | None) -> float | None:
 
 
 async def strike_all(faults: Sequence[Fault]) -> list[dict[str, Any]]:
-    """One after the other, each told as it is found."""
+    """Run one fault after the other, and print each verdict."""
     rows = []
     for fault in faults:
         rows.append(await strike(fault))
@@ -539,7 +539,7 @@ async def strike_all(faults: Sequence[Fault]) -> list[dict[str, Any]]:
 
 
 def result_of(rows: Sequence[dict[str, Any]]) -> Result:
-    """The table, and what is asked of all faults together."""
+    """Return the table, and the marks of all faults together."""
     what = {fault.name: fault.what for fault in FAULTS}
     columns = (
         "fault",
@@ -572,18 +572,18 @@ def result_of(rows: Sequence[dict[str, Any]]) -> Result:
     starts = (f"From the start of a unit's process until it registered, s: {started}.",) if started else ()
     marks = (
         Mark("faults after which a mark was missed", float(sum(not each["met"] for each in rows)), at_most=0.0),
-        Mark("longest until it was noticed, s", _longest(rows, "noticed_s"), at_most=NOTICED_S_MAX),
-        Mark("longest until the map was right again, s", _longest(rows, "recovered_s"), at_most=RECOVERED_S_MAX),
+        Mark("longest time until noticed, s", _longest(rows, "noticed_s"), at_most=NOTICED_S_MAX),
+        Mark("longest time until the map was right again, s", _longest(rows, "recovered_s"), at_most=RECOVERED_S_MAX),
         Mark(
-            "faults that made a map say free of what nobody sees", float(sum(each["false_free"] for each in rows)), 0.0
+            "faults after which a map called an unseen place free", float(sum(each["false_free"] for each in rows)), 0.0
         ),
-        Mark("acknowledged things lost", float(sum(each["lost"] for each in rows)), at_most=0.0),
+        Mark("acknowledged values lost", float(sum(each["lost"] for each in rows)), at_most=0.0),
     )
     return Result("Faults, with real processes", columns, cells, marks, (*REMARKS, *starts))
 
 
 def _longest(rows: Sequence[dict[str, Any]], name: str) -> float:
-    """Of those in which there was something to notice or to recover from."""
+    """Return the longest time over the faults that have a value."""
     return max((each[name] for each in rows if each[name] is not None), default=0.0)
 
 
@@ -603,7 +603,7 @@ def _cell(value: float | None) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run; exit code 1 when a mark is missed."""
+    """Run. The exit code is 1 when a mark is missed."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(arguments)
     try:

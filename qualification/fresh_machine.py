@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make fresh-machine`: both commands of the README, on Debians that have only Python, its venv and make.
+"""`make fresh-machine`: run both commands of the README on Debians that have only Python, its venv and make.
 
-A newcomer without any privilege runs `make demo` and `make test` in a checkout, in one root file system after the
-other. What a test needs that no wheel brings (a browser, git, machines that boot) it must skip with its reason; the
-reasons are told. With `--smoke`, a short demo, and the tests that would notice what such a machine lacks, in an
-environment with compiled kernels that is kept for the next time; making it does not count in the seconds, nor does
-fetching Debian ever. Prints one line of JSON at the end, also when it fails. Needs root.
+An unprivileged user runs `make demo` and `make test` in a checkout, in one root file system after the other. A test
+that needs more than wheels (a browser, git, machines that boot) must skip with its reason; the reasons are printed.
+`--smoke` runs a short demo, and the tests that depend on the tools of such a machine. It uses an environment with
+compiled kernels that is kept for the next run. The time to make this environment and to fetch Debian does not count.
+The command prints one line of JSON at the end, also when it fails. Needs root.
 
 Exit code 1: a command failed. 3: Debian or the wheels cannot be fetched.
 """
@@ -48,22 +48,22 @@ SOURCE = Path(__file__).resolve().parents[1]
 FOLDER = Path("out/fresh-machine")
 
 DEMO_S, SMOKE_DEMO_S = 20, 8
-"""So many seconds of its frames count."""
+"""Seconds of the demo's frames that count."""
 
 UNITS = 4
-"""Of a demo that nobody told how many."""
+"""Number of units of a demo by default."""
 
 SMOKE_ENVIRONMENT = "make .venv/ready && .venv/bin/python -m simulation.fleet.warm_up"
-"""What the smoke part begins with, and keeps: wheels and compiled kernels."""
+"""First command of the smoke part. Its wheels and compiled kernels are kept."""
 
 ENVIRONMENT_S_MAX = 900.0
-"""For wheels to be fetched and installed, some 50 s when they are cached, and for kernels."""
+"""Time limit to fetch and install the wheels, some 50 s from a cache, and to compile the kernels."""
 
 DEMO_S_MAX = 300.0
-"""For kernels to be compiled from nothing, and for the demo."""
+"""Time limit to compile the kernels from nothing, and to run the demo."""
 
 TEST_S_MAX = 3600.0
-"""For all tests, which take some 10 minutes on two processors that have nothing else to do."""
+"""Time limit of all tests, which take some 10 minutes on two idle processors."""
 
 SMOKE_TEST_S_MAX = 300.0
 
@@ -73,21 +73,21 @@ SMOKE_TESTS = (
     "tests/edge_unit/sources/realsense/test_live_camera.py",
     "tests/geometry/kernels/test_voxelize.py",
 )
-"""They need git, libusb and compiled kernels: what such a machine lacks, or makes itself."""
+"""Tests that need git, libusb or compiled kernels, which such a machine lacks or makes itself."""
 
 REPORT = f"$(mktemp ../{REPORTS}/XXXXXX)"
-"""A file for each run of pytest, of which `make test` makes more than one."""
+"""A file for each run of pytest; `make test` runs it more than once."""
 
 DECIDES_ENVIRONMENT = ("pyproject.toml", "constraints.txt", "Makefile", "scripts/find-python")
-"""Files of which a change makes another environment."""
+"""Files whose change requires another environment."""
 
 TAIL_LINES = 30
-"""The end of a log that is shown when its command failed."""
+"""Lines of a log that are printed when its command failed."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """What became of one root: the figures of the issue, and no others."""
+    """Results of one root file system."""
 
     debian: str
     python: str
@@ -100,24 +100,24 @@ class Row:
 
 @dataclass
 class Tests:
-    """What pytest counted."""
+    """Counts of pytest."""
 
     passed: int = 0
     failed: int = 0
     skipped: Counter[str] = field(default_factory=Counter)
-    """By reason."""
+    """Number of skipped tests by reason."""
     names: list[str] = field(default_factory=list)
-    """Of those that failed."""
+    """Names of the failed tests."""
 
 
 def counted(reports: Path, code: int | None) -> Tests:
-    """What the reports in a folder say that pytest wrote by `--junitxml`, before the command ended with `code`."""
+    """Return the counts of the `--junitxml` reports in a folder, for a command that ended with `code`."""
     tests = Tests()
     for report in sorted(reports.glob("*")):
         try:
             cases = list(ElementTree.parse(report).getroot().iter("testcase"))
         except ElementTree.ParseError:
-            # pytest writes it last of all; whatever kept it from that has made an exit code.
+            # pytest writes the report last. A failure before that shows in the exit code.
             continue
         for case in cases:
             skipped = case.find("skipped")
@@ -135,7 +135,7 @@ def counted(reports: Path, code: int | None) -> Tests:
 
 
 def demo_trouble(code: int | None, said: str) -> str | None:
-    """What was wrong with a demo; none when it ended by itself and had all units' frames."""
+    """Return the failure of a demo; None if it ended by itself and had frames of all units."""
     if code is None:
         return "it did not end"
     if code:
@@ -143,7 +143,7 @@ def demo_trouble(code: int | None, said: str) -> str | None:
     try:
         figures = json.loads(said.strip().splitlines()[-1])
     except (IndexError, json.JSONDecodeError):
-        return "its last line is no JSON"
+        return "its last line is not JSON"
     if figures["failures"]:
         return "; ".join(figures["failures"])
     if len(figures["fps_per_unit"]) != UNITS or min(figures["fps_per_unit"]) <= 0.0:
@@ -152,7 +152,7 @@ def demo_trouble(code: int | None, said: str) -> str | None:
 
 
 class Visit:
-    """A newcomer on one fresh machine."""
+    """A new user on one fresh machine."""
 
     def __init__(self, machine: FreshDebian, logs: Path, lent: Lent, smoke: bool) -> None:
         self._machine = machine
@@ -167,11 +167,11 @@ class Visit:
 
         Raises:
             Unreachable: Debian or the wheels cannot be fetched.
-            ConfigError: this is no checkout.
+            ConfigError: the folder is no checkout.
         """
         machine, began_ns = self._machine, monotonic_ns()
         made = machine.install()
-        self._say(f"Debian {'fetched' if made else 'is there'}", began_ns)
+        self._say(f"Debian {'fetched' if made else 'already present'}", began_ns)
         environment = hashlib.sha256()
         for name in DECIDES_ENVIRONMENT:
             environment.update((SOURCE / name).read_bytes())
@@ -239,7 +239,7 @@ class Visit:
 
 
 def why_not() -> str | None:
-    """Why it cannot be run here, in one sentence; None where it can."""
+    """Return the reason, in one sentence, for which the test cannot run here; None if it can."""
     if os.geteuid() != 0:
         return "only root may make root file systems"
     if (missing := missing_packages(TOOLS)) is not None:
@@ -252,7 +252,7 @@ def why_not() -> str | None:
 
 
 def result_of(rows: Sequence[Row], smoke: bool) -> Result:
-    """For people."""
+    """Return the table and marks."""
     columns = ("debian", "python", "passed", "failed", "skipped", "seconds")
     return Result(
         f"README's commands where there are only Python, its venv and make{', the smoke part' if smoke else ''}",
@@ -271,7 +271,7 @@ def result_of(rows: Sequence[Row], smoke: bool) -> Result:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run; exit code 1 when a command failed, 3 when Debian or the wheels cannot be fetched."""
+    """Run. The exit code is 1 when a command failed, 3 when Debian or the wheels cannot be fetched."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(arguments)
     rows: list[Row] = []
@@ -309,9 +309,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="make fresh-machine", description=(__doc__ or "").split("\n\n")[1])
     parser.add_argument("--roots", nargs="+", choices=tuple(SUITES), default=tuple(SUITES), help="default: all")
-    parser.add_argument("--smoke", action="store_true", help="a short demo and few tests, and what is made is kept")
+    parser.add_argument(
+        "--smoke", action="store_true", help="a short demo and a few tests, in an environment that is kept"
+    )
     parser.add_argument("--folder", type=Path, default=FOLDER, help=f"roots, wheels, logs (default: {FOLDER})")
-    parser.add_argument("--no-results", action="store_true", help="leave out/results as it is")
+    parser.add_argument("--no-results", action="store_true", help="do not write out/results")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     return parser
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make image-test`: two arm64 boards boot from one and the same image, in QEMU, and report to a master.
+"""`make image-test`: boot two arm64 boards from the same image in QEMU, and let them report to a master.
 
-What a board does at its first boot, but for its own boot firmware, its kernel and its camera: firmware and kernel are
-QEMU's and Debian's, the camera is simulated. Nobody tells the boards a name, an address or where their master is.
-Prints one line of JSON at the end, also when it fails. Needs root.
+It covers the first boot of a board, except for its boot firmware, its kernel and its camera: firmware and kernel are
+QEMU's and Debian's, and the camera is simulated. The boards are not configured with a name, an address or the place of
+their master. The command prints one line of JSON at the end, also when it fails. Needs root.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ MASTER_IP = "10.77.0.1"
 BOARDS = 2
 
 MASTER_S = 60.0
-"""For the master to be there, on a busy computer."""
+"""Time limit for the master to start on a busy computer."""
 
-LOOK_EVERY_S = 0.5
-"""The boards need the processor more than we do."""
+CHECK_EVERY_S = 0.5
+"""Time between two checks, which leaves the processor to the boards."""
 
 WAIT_S = 400.0
-"""For all boards to report, from when they were switched on."""
+"""Time limit for all boards to report, from power-on."""
 
 
 class Watch:
-    """What is known of the boards so far, whatever becomes of them."""
+    """State of the boards so far, also if the test fails."""
 
     def __init__(self, boards: Sequence[Board], leases: Path, operator: httpx.Client) -> None:
         self._boards = boards
@@ -57,12 +57,12 @@ class Watch:
         self.first_voxel_s: dict[str, float] = {}
 
     def names(self) -> dict[str, str]:
-        """The host name with which each address was asked for."""
+        """Return the host name by which each address sent its request."""
         lines = self._leases.read_text().splitlines() if self._leases.exists() else []
         return {fields[2]: fields[3] for fields in map(str.split, lines) if len(fields) >= 4}
 
     def all_report(self) -> bool:
-        """Look once; whether every board has reported a voxel."""
+        """Check once, and return True if every board has reported a voxel."""
         for board in self._boards:
             board.require_running()
         began_ns = self._boards[0].switched_on_ns
@@ -76,7 +76,7 @@ class Watch:
         return len(self.first_voxel_s) == len(self._boards)
 
     def document(self) -> dict[str, Any]:
-        """The figures. Seconds are those of the last board, none while one is missing."""
+        """Return the figures. Seconds are those of the last board, None while one is missing."""
         names = self.names()
         whole = len(self.first_voxel_s) == len(self._boards)
         return {
@@ -100,7 +100,7 @@ Start = Callable[..., None]
 
 @contextmanager
 def processes(logs: Path) -> Iterator[Start]:
-    """Starts processes, each with a log of its own; they end with the context."""
+    """Start processes, each with a log of its own. They end with the context."""
     with ExitStack() as stack:
 
         def start(name: str, *command: str) -> None:
@@ -113,10 +113,10 @@ def processes(logs: Path) -> Iterator[Start]:
 
 
 def boot(parts: Path, wait_s: float, document: dict[str, Any]) -> None:
-    """Boot them all until each has reported a voxel; what is found goes into `document` as far as it got.
+    """Boot all boards, and wait until each has reported a voxel. `document` gets the figures, also partial ones.
 
     Raises:
-        MachineError: one does not report within `wait_s`.
+        MachineError: a board does not report within `wait_s`.
         ConfigError: the network cannot be made.
     """
     logs, state = parts / "logs", parts / "master"
@@ -126,7 +126,7 @@ def boot(parts: Path, wait_s: float, document: dict[str, Any]) -> None:
     shutil.copy(parts / "unit.token", state / "unit.token")
     (state / "unit.token").chmod(0o600)
     run("ip", "link", "set", "lo", "up")
-    # All ports hear all multicast: nobody here asks who wants which.
+    # All ports receive all multicast, because no machine here snoops for subscriptions.
     run("ip", "link", "add", BRIDGE, "type", "bridge", "mcast_snooping", "0")
     run("ip", "address", "add", f"{MASTER_IP}/24", "dev", BRIDGE)
     run("ip", "link", "set", BRIDGE, "up")
@@ -152,7 +152,7 @@ def boot(parts: Path, wait_s: float, document: dict[str, Any]) -> None:
         ]
         watch = Watch(boards, leases, operator)
         try:
-            until(watch.all_report, f"{BOARDS} boards that report voxels", wait_s, LOOK_EVERY_S)
+            until(watch.all_report, f"{BOARDS} boards that report voxels", wait_s, CHECK_EVERY_S)
         except MachineError:
             for board in boards:
                 print(f"---- the end of {board.name}'s console\n{board.tail()}", file=sys.stderr, flush=True)
@@ -162,16 +162,18 @@ def boot(parts: Path, wait_s: float, document: dict[str, Any]) -> None:
 
 
 def why_not(building: bool = False) -> str | None:
-    """Why it cannot be run here, in one sentence that names all packages which are missing; None where it can."""
+    """Return the reason, in one sentence, for which the test cannot run here, with all missing packages; None if it
+    can.
+    """
     if os.geteuid() != 0:
-        return "only root may make networks and images"
+        return "networks and images: expected to run as root"
     if not allowed(NAMESPACES):
         return "the kernel does not allow network, mount and process namespaces"
     return missing_packages(EMULATOR_TOOLS | (BUILD_TOOLS if building else {}))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run; exit code 1 when a board does not report, or two have one name."""
+    """Run. The exit code is 1 when a board does not report, or two boards have the same name."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(arguments)
     began_ns = monotonic_ns()
@@ -213,12 +215,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def result_of(document: dict[str, Any]) -> Result:
-    """For people; what did not come about has no figure."""
+    """Return the table and marks. A step that was not reached has no figure."""
     figures = (
         ("from power-on to the first voxel, s", document.get("seconds_power_on_to_first_voxel")),
         ("image, MB", document.get("image_mb")),
-        ("of that the release, MB", document.get("payload_mb")),
-        ("all of it, with what had to be built, s", document.get("seconds")),
+        ("release in the image, MB", document.get("payload_mb")),
+        ("total with the build, s", document.get("seconds")),
     )
     return Result(
         f"{BOARDS} arm64 boards of one image, every instruction emulated",
@@ -233,11 +235,15 @@ def result_of(document: dict[str, Any]) -> Result:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="make image-test", description=(__doc__ or "").split("\n\n")[1])
-    parser.add_argument("--parts", type=Path, default=PARTS, help=f"what is booted, and the logs (default: {PARTS})")
+    parser.add_argument(
+        "--parts", type=Path, default=PARTS, help=f"folder of the image and the logs (default: {PARTS})"
+    )
     parser.add_argument("--cache", type=Path, default=CACHE, help=f"compiled kernels (default: {CACHE})")
-    parser.add_argument("--no-build", action="store_true", help="boot the image that is there")
-    parser.add_argument("--wait-s", type=float, default=WAIT_S, help=f"for the boards to report (default {WAIT_S:g})")
-    parser.add_argument("--no-results", action="store_true", help="leave out/results as it is")
+    parser.add_argument("--no-build", action="store_true", help="boot the existing image")
+    parser.add_argument(
+        "--wait-s", type=float, default=WAIT_S, help=f"time limit for the boards to report (default {WAIT_S:g})"
+    )
+    parser.add_argument("--no-results", action="store_true", help="do not write out/results")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     return parser
 

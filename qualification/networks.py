@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Networks that fail: namespaces of our own with a cable between them, and a proxy that is slow, cuts and remembers.
+"""Networks that fail: private namespaces with a cable between them, and a proxy that delays, cuts and records.
 
-All runs in namespaces without a name, which the kernel takes away with their last process, however that ends; the
-machine's own interfaces and mounts are never touched.
+Everything runs in unnamed namespaces, which the kernel removes with their last process, however it ends. The machine's
+own interfaces and mounts are never changed.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from shared.errors import ConfigError
 from simulation.fleet.processes import raise_when_stopped
 
 MASTER_IP, UNIT_IP = "10.77.0.1", "10.77.0.2"
-"""At the two ends of the cable."""
+"""Addresses at the two ends of the cable."""
 
 CHUNK_BYTES = 65536
 
 
 NAMESPACES = (("unshare", "--net", "--mount"), ("unshare", "--user", "--map-root-user", "--net", "--mount"))
-"""As root; as anyone, where the kernel lets them."""
+"""Commands for root, and for any user if the kernel allows it."""
 
 
 def allowed(unshare: Sequence[str]) -> bool:
-    """Whether this command can make its namespaces here."""
+    """Return True if this command can make its namespaces here."""
     try:
         return not subprocess.run((*unshare, "true"), capture_output=True, check=False).returncode
     except FileNotFoundError:
@@ -38,7 +38,7 @@ def allowed(unshare: Sequence[str]) -> bool:
 
 
 def confine(module: str, arguments: Sequence[str], inside: bool) -> None:
-    """Go on with a network and mounts of our own, where a request to end raises KeyboardInterrupt.
+    """Continue with a private network and private mounts; SIGTERM then raises KeyboardInterrupt.
 
     Unless this process is `inside` already, `python -m module --inside arguments` takes its place.
 
@@ -73,8 +73,8 @@ class Cable:
     """Another network namespace, and a cable from there to here."""
 
     def __init__(self) -> None:
-        """Raises ConfigError when it cannot be laid."""
-        # `echo` tells that the namespace is there; `read` keeps it until we are gone.
+        """Make the cable. Raises ConfigError if that fails."""
+        # `echo` reports that the namespace exists; `read` keeps it until this process ends.
         self._holder = subprocess.Popen(
             ("unshare", "--net", "sh", "-c", "echo; read line"), stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
@@ -88,27 +88,27 @@ class Cable:
         self.plug()
 
     def plug(self) -> None:
-        """Plug it in."""
+        """Plug the cable in."""
         run("ip", "link", "set", "cut0", "up")
 
     def pull(self) -> None:
-        """Pull it out."""
+        """Pull the cable out."""
         run("ip", "link", "set", "cut0", "down")
 
     def close(self) -> None:
-        """Take it away with its namespace."""
+        """Remove the cable with its namespace."""
         self._holder.communicate()
 
 
 @dataclass
 class Proxy:
-    """Passes TCP on from a port of its own to the master, as if from the unit's own address."""
+    """Forwards TCP from a port of its own to the master, with the unit's own address as the source."""
 
     master_port: int
     unit_address: str
     delay_s: float = 0.0
     jitter_s: float = 0.0
-    """Of what the unit sends; what it is answered comes at once."""
+    """Jitter of the unit's data. Answers are forwarded at once."""
 
     sent: list[bytes] = field(default_factory=list)
     """Whole requests of the unit, oldest first."""
@@ -124,7 +124,7 @@ class Proxy:
         self.url = f"http://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
 
     def cut(self) -> None:
-        """Reset all connections that there are; new ones are taken."""
+        """Reset all open connections. New ones are accepted."""
         for writer in list(self._writers):
             writer.transport.abort()
 
@@ -149,13 +149,13 @@ class Proxy:
             self._writers |= ends
             ways = self._take(reader, waiting), self._pass_on(waiting, to_master), self._back(answers, writer)
             tasks = [asyncio.create_task(way) for way in ways]
-            # One end is gone, and so is the other; whoever needs them connects anew.
+            # One end is closed, so the other is closed, too. The client reconnects.
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for way in tasks:
                 way.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
         except OSError:
-            # The master is not there.
+            # The master is not running.
             pass
         finally:
             self._tasks.discard(task)
@@ -164,7 +164,7 @@ class Proxy:
                 end.transport.abort()
 
     async def _take(self, reader: asyncio.StreamReader, waiting: asyncio.Queue[tuple[int, bytes]]) -> None:
-        """What the unit sends, each piece with the time at which it is due, and remembered request by request."""
+        """Read the unit's data, queue each piece with the time at which it is due, and record it request by request."""
         begun = b""
         while data := await reader.read(CHUNK_BYTES):
             late_s = max(self.delay_s + random.uniform(-self.jitter_s, self.jitter_s), 0.0)
@@ -172,7 +172,7 @@ class Proxy:
             begun = self._remember(begun + data)
 
     async def _pass_on(self, waiting: asyncio.Queue[tuple[int, bytes]], writer: asyncio.StreamWriter) -> None:
-        """To the master, in its order."""
+        """Forward the data to the master, in order."""
         while True:
             due_ns, data = await waiting.get()
             await asyncio.sleep(max(due_ns - monotonic_ns(), 0) / NS_PER_S)
@@ -185,7 +185,7 @@ class Proxy:
             await writer.drain()
 
     def _remember(self, data: bytes) -> bytes:
-        """Keep the requests that are whole; returns the rest."""
+        """Record the complete requests, and return the rest."""
         while b"\r\n\r\n" in data:
             head, _, rest = data.partition(b"\r\n\r\n")
             length = next(

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make soak`: a cell of real processes to which all sorts of things happen at once, for as long as is wished.
+"""`make soak`: run a cell of real processes with random failures for a chosen time.
 
-A master, two units before cameras whose pictures are known, a robot's controller, and two who ask for the map all the
-time. Faults are drawn from a seed that is printed: processes are killed, stopped and started, cameras unplugged, the
-cable of a unit pulled, wall clocks stepped, settings changed, the stream read by many and by some who never take a
-message. After each round they end; the map must then be what it was before the first, and memory, threads and handles
-of each process are looked at. In between, no answer may be wrong. Prints tables, and at the end all of it as one line
-of JSON; exits with 1 when a mark is missed.
+The cell has a master, two units with known camera images, a robot's controller, and two observers that read the map all
+the time. Faults are drawn from a seed that is printed: processes are killed, stopped and started, cameras unplugged,
+the cable of a unit pulled, wall clocks stepped, settings changed, the stream read by many and by some that never take a
+message. After each round the faults end. The map must then equal the map before the first fault, and memory, threads
+and handles of each process are counted. In between, no answer may be wrong. The command prints tables and, at the end,
+all figures as one line of JSON. The exit code is 1 when a mark is missed.
 """
 
 from __future__ import annotations
@@ -50,28 +50,29 @@ MINUTES = 30.0
 ROUND_S = 50.0
 
 EARLY_SHARE = 1.0 / 3.0
-"""Of the rounds; in the rest nothing that is to live long is ended."""
+"""Share of the early rounds. In the later rounds no long-lived process is killed."""
 
 CALM_S = 30.0
-"""From the end of the last fault to a map that is right again: cameras are looked for every 5 s, on a busy machine."""
+"""Time limit from the end of the last fault to a right map: the unit searches for cameras every 5 s, on a busy machine.
+"""
 
 QUIET_S = 2.0
-"""For connections of before to be closed, until handles are counted."""
+"""Time for old connections to close before handles are counted."""
 
 LOOK_S = 0.1
 
 JUDGE_S = 1.0
 
 EVENTS = "events.log"
-"""Times are the master's `now_ns`."""
+"""Log of events; its times are the master's `now_ns`."""
 
 SHOWN = 10
-"""Wrong answers that are told one by one."""
+"""Number of wrong answers that are printed."""
 
 
 @dataclass
 class Calm:
-    """What was found when a round was over; `trouble` is empty when all was right."""
+    """State at the end of a round; `trouble` is empty if all is right."""
 
     at_s: float
     recovered_s: float
@@ -80,7 +81,7 @@ class Calm:
 
 @dataclass
 class Found:
-    """All that came of a soak."""
+    """All results of a soak."""
 
     strikes: list[Strike] = field(default_factory=list)
     calms: list[Calm] = field(default_factory=list)
@@ -92,7 +93,7 @@ class Found:
 
 
 class Soak:
-    """A site, and the rounds that it goes through."""
+    """A site, and its rounds."""
 
     def __init__(self, site: SoakSite, seed: int, seconds: float) -> None:
         self._site, self._seed, self._seconds = site, seed, seconds
@@ -102,10 +103,10 @@ class Soak:
         self.found = Found()
 
     async def run(self) -> Found:
-        """All rounds.
+        """Run all rounds.
 
         Raises:
-            FaultError: the cell was not right to begin with.
+            FaultError: the cell was not right at the start.
         """
         site, found = self._site, self.found
         try:
@@ -113,7 +114,7 @@ class Soak:
             if trouble := (await self._calm(START_S)).trouble:
                 raise FaultError(f"before the first fault: {trouble}")
             found.calms.clear()
-            # Until both units were known to the master, a map without one of them was complete.
+            # Before both units were registered, a map without one of them was complete.
             site.begin_judging()
             rounds = max(round(self._seconds / ROUND_S), 2)
             async with _Beside(self._usage.run(), self._judge()):
@@ -128,7 +129,7 @@ class Soak:
                     )
             site.judge_all()
         finally:
-            await site.look_away()
+            await site.stop_observers()
             site.close()
         found.lifetimes = self._usage.lifetimes
         found.judged, found.wrongs, found.ended = site.judged, site.wrongs, site.ended
@@ -140,14 +141,14 @@ class Soak:
         return found
 
     async def _round(self, strikes: Sequence[Strike], number: int) -> None:
-        """All faults of a round; when it returns, all are undone."""
+        """Run all faults of a round. All of them are undone at the return."""
         self.found.strikes.extend(strikes)
         began_ns = monotonic_ns()
 
         async def one(place: int, strike: Strike) -> None:
             await asyncio.sleep(strike.at_s - (monotonic_ns() - began_ns) / NS_PER_S)
             target = KINDS[strike.name].target
-            # One that took longer to undo than was planned holds up the next.
+            # A fault that takes longer to undo than planned delays the next one.
             async with locks[target]:
                 self._log(f"begin {strike.name}")
                 await self._site.strike(
@@ -159,12 +160,14 @@ class Soak:
         await asyncio.gather(*(one(place, strike) for place, strike in enumerate(strikes)))
 
     def _log(self, text: str) -> None:
-        """For whoever wants to know what was going on when an answer was wrong."""
+        """Log an event, so that a wrong answer can be explained later."""
         with (self._site.folder / "logs" / EVENTS).open("a") as file:
             file.write(f"{monotonic_ns()} {text}\n")
 
     async def _calm(self, timeout_s: float) -> Calm:
-        """Wait until the map is what it was before all faults, and stays so; then count what everyone holds."""
+        """Wait until the map is again as it was before all faults, and stays so; then count the resources of all
+        processes.
+        """
         began_ns = monotonic_ns()
         deadline_ns = began_ns + round(timeout_s * NS_PER_S)
         right_since_ns: int | None = None
@@ -190,8 +193,8 @@ class Soak:
         return calm
 
     async def _trouble(self) -> str:
-        """What is not as it was."""
-        answer = self._site.asker.answers[-1]
+        """Return the difference to the map before all faults, in words."""
+        answer = self._site.poller.answers[-1]
         if answer.now_ns is None:
             return "the master does not answer"
         if not answer.complete:
@@ -211,7 +214,7 @@ class Soak:
 
 
 class _Beside:
-    """Work that goes on beside a block; what fails of it ends the block's task at its end."""
+    """Work in parallel to a block. Its failure is raised at the end of the block."""
 
     def __init__(self, *works: Coroutine[Any, Any, None]) -> None:
         self._works = works
@@ -228,24 +231,24 @@ class _Beside:
 
 
 def results(found: Found) -> dict[str, Result]:
-    """What happened, what came of it, and what the processes held."""
+    """Return the tables of events, rounds and resources."""
     counts = Counter(strike.name for strike in found.strikes)
     held_s: defaultdict[str, float] = defaultdict(float)
     for strike in found.strikes:
         held_s[strike.name] += strike.hold_s
     faults = Result(
-        "What happened",
+        "Events",
         ("fault", "times", "s in all"),
         tuple((name, counts[name], round(float(held_s[name]), 1)) for name in KINDS if counts[name]),
     )
     wrongs = tuple(found.wrongs[:SHOWN])
     lost = [calm for calm in found.calms if calm.trouble]
     calms = Result(
-        "When it was over",
+        "State after each round",
         ("round", "at s", "right again after s", "what was not"),
         tuple((n, calm.at_s, calm.recovered_s, calm.trouble or "-") for n, calm in enumerate(found.calms, 1)),
         (
-            Mark("answers that were wrong", float(len(found.wrongs)), at_most=0.0, why="; ".join(wrongs) or None),
+            Mark("wrong answers", float(len(found.wrongs)), at_most=0.0, why="; ".join(wrongs) or None),
             Mark(
                 f"rounds after which the map was not what it was within {CALM_S:g} s",
                 float(len(lost)),
@@ -290,14 +293,14 @@ def _process_result(judged: Sequence[Lifetime], count: int) -> Result:
         f"more: threads and handles at the last calm moment beyond the most of any in the first half of these; {SPARE} "
         "are spare, for pools that were never full at once and connections that a unit keeps or not.",
     )
-    return Result("What the processes held", columns, tuple(rows), marks, remarks)
+    return Result("Resources of the processes", columns, tuple(rows), marks, remarks)
 
 
 async def soak(folder: Path, seed: int, seconds: float) -> Found:
-    """All of it, on a site of its own.
+    """Run a whole soak on a site of its own.
 
     Raises:
-        CellwatchError: it could not begin.
+        CellwatchError: the soak could not start.
     """
     async with Processes(folder / "logs", without=(UNIT_PREFIX, MASTER_PREFIX)) as processes:
         return await Soak(SoakSite(folder, processes), seed, seconds).run()
@@ -305,7 +308,7 @@ async def soak(folder: Path, seed: int, seconds: float) -> Found:
 
 @contextmanager
 def _folder() -> Iterator[Path]:
-    """A folder that is kept when something in it is to be looked at."""
+    """Return a folder that is kept if something in it needs inspection."""
     folder = Path(tempfile.mkdtemp(prefix="cellwatch-soak-"))
     try:
         yield folder
@@ -315,7 +318,7 @@ def _folder() -> Iterator[Path]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run; exit code 1 when a mark is missed."""
+    """Run. The exit code is 1 when a mark is missed."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(arguments)
     try:
@@ -353,13 +356,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="make soak", description="A cell to which all sorts of things happen at once."
-    )
-    parser.add_argument("--minutes", type=float, default=MINUTES, help=f"of faults ({MINUTES:g})")
-    parser.add_argument("--seconds", type=float, help="the same in seconds")
-    parser.add_argument("--seed", type=int, help="decides which faults, and when; absent: another every time")
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for soak.json")
+    parser = argparse.ArgumentParser(prog="make soak", description="Run a cell with random failures.")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help=f"duration of the faults ({MINUTES:g})")
+    parser.add_argument("--seconds", type=float, help="the same duration in seconds")
+    parser.add_argument("--seed", type=int, help="seed of the faults and their times; default: random")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="folder for soak.json")
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
     return parser
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make source-faults`: what a RealSense source does when the camera makes trouble, with objects of the real SDK.
+"""`make source-faults`: test a RealSense source with camera failures, with objects of the real SDK.
 
 Cameras are recordings on the SDK's context, plugged in and out; capture processes are stopped and killed. For each
-fault: how long until the state was told, and until frames flowed again. Prints the table, and at the end all of it as
-one line of JSON; exits with 1 when a mark is missed.
+fault the command measures the time until the state was reported, and until frames flowed again. It prints the table
+and, at the end, all figures as one line of JSON. The exit code is 1 when a mark is missed.
 """
 
 from __future__ import annotations
@@ -42,14 +42,16 @@ NOTICED_MS_MAX = 1000.0
 BACK_S_MAX = 5.0
 
 CALM_S = 0.5
-"""Of frames before each fault."""
+"""Seconds of frames before each fault."""
 
 GIVE_UP_S = 30.0
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one fault: until it was told, and until frames flowed again from when they could; NaN where none are to."""
+    """Times of one fault: until it was reported, and from the possible recovery until frames flowed again; NaN if none
+    are expected.
+    """
 
     noticed_ms: float
     back_s: float
@@ -58,7 +60,7 @@ class Outcome:
 
 @dataclass
 class Watched:
-    """A source, everything that it delivered, and everything that it told."""
+    """A source with all its frames and status reports."""
 
     source: RealsenseSource
     sockets: Path
@@ -68,13 +70,13 @@ class Watched:
     told: list[SourceStatus] = field(default_factory=list)
 
     async def read(self) -> None:
-        """Take frames for as long as there are any."""
+        """Read frames until they end."""
         async for frame in self.source.frames():
             self.numbers.append(frame.frame_number)
             self.taken_ns.append(monotonic_ns())
 
     async def listen(self) -> None:
-        """Hear what it tells."""
+        """Read the status reports."""
         self.told.append(self.source.status)
         while True:
             self.told.append(await self.source.next_status(self.told[-1]))
@@ -94,7 +96,7 @@ class Watched:
             raise SourceError(f"after {GIVE_UP_S:g} s still {self.source.status}")
 
     async def trouble(self) -> None:
-        """Wait until it is told that no frames come."""
+        """Wait until the source reports a failure."""
         await self.until(lambda: self.source.status.trouble is not None)
 
     async def live(self) -> None:
@@ -102,11 +104,11 @@ class Watched:
         await self.until(lambda: self.source.status.state == "live")
 
     def noticed_ms(self, since_ns: int) -> float:
-        """From `since_ns` to the first trouble told."""
+        """Return the milliseconds from `since_ns` to the first reported failure."""
         return min(s.since_ns - since_ns for s in self.told if s.trouble and s.since_ns >= since_ns) / NS_PER_MS
 
     def back_s(self, since_ns: int, told_ns: int) -> float:
-        """From `since_ns` to the first frame taken after `told_ns`."""
+        """Return the seconds from `since_ns` to the first frame taken after `told_ns`."""
         return min(at_ns - since_ns for at_ns in self.taken_ns if at_ns > told_ns) / NS_PER_S
 
 
@@ -114,7 +116,7 @@ Fault = Callable[[Watched], Awaitable[Outcome]]
 
 
 async def unplugged(watched: Watched) -> Outcome:
-    """Unplugged, and plugged in again when its absence was told."""
+    """Unplug the camera, and plug it in again after its absence was reported."""
     out_ns = monotonic_ns()
     plug(watched.sockets, [])
     await watched.until(lambda: watched.source.status.state == "absent")
@@ -127,7 +129,7 @@ async def unplugged(watched: Watched) -> Outcome:
 
 
 async def unplugged_for_a_moment(watched: Watched) -> Outcome:
-    """Unplugged and plugged in again 0.1 s later, as a loose plug does."""
+    """Unplug the camera and plug it in again 0.1 s later, like a loose plug."""
     out_ns = monotonic_ns()
     plug(watched.sockets, [])
     await asyncio.sleep(0.1)
@@ -136,12 +138,12 @@ async def unplugged_for_a_moment(watched: Watched) -> Outcome:
 
 
 async def killed(watched: Watched) -> Outcome:
-    """The capture process is killed, as by the SDK's own crash."""
+    """Kill the capture process, like a crash of the SDK."""
     return await _signalled(watched, signal.SIGKILL)
 
 
 async def stopped(watched: Watched) -> Outcome:
-    """The capture process stands still, as in a call of the SDK that does not return."""
+    """Stop the capture process, like a call of the SDK that does not return."""
     return await _signalled(watched, signal.SIGSTOP)
 
 
@@ -169,10 +171,10 @@ FAULTS: tuple[tuple[str, Fault], ...] = (
 
 
 async def flowing(fault: Fault, recording: Path, folder: Path) -> Outcome:
-    """A fault of a camera that delivers.
+    """Run a fault of a camera that delivers frames.
 
     Raises:
-        SourceError: it does not recover, or a frame came twice.
+        SourceError: the camera does not recover, or a frame came twice.
     """
     sockets = folder / "sockets"
     plug(sockets, [recording])
@@ -202,7 +204,7 @@ async def _running(watched: Watched) -> AsyncIterator[None]:
 
 
 async def absent_at_start(recording: Path, folder: Path) -> Outcome:
-    """The wanted serial is not there when the unit starts, and is plugged in when that was told."""
+    """Start a unit without its serial, and plug the camera in after its absence was reported."""
     sockets = folder / "sockets"
     plug(sockets, [])
     source = RealsenseSource(RealsenseSourceConfig(serial=SERIAL), command(sockets))
@@ -222,7 +224,7 @@ async def absent_at_start(recording: Path, folder: Path) -> Outcome:
 
 
 async def cut_in_half(recording: Path, folder: Path) -> Outcome:
-    """A recording cut in half is refused; it will not get better."""
+    """Open a recording cut in half. It is refused, because it cannot recover."""
     half = folder / "half.db3"
     half.write_bytes(recording.read_bytes()[: recording.stat().st_size // 2])
     source = RealsenseSource(RealsenseSourceConfig(recording=half))
@@ -231,11 +233,11 @@ async def cut_in_half(recording: Path, folder: Path) -> Outcome:
         await source.open()
     except SourceError as error:
         return Outcome((monotonic_ns() - began_ns) / NS_PER_MS, float("nan"), str(error).split(": ", 1)[1])
-    raise SourceError(f"{half}: expected to be refused, and it was opened")
+    raise SourceError(f"{half}: expected the recording to be refused, but it was opened")
 
 
 async def started(recording: Path, folder: Path) -> float:
-    """Seconds from nothing to the first frame of a camera that is there."""
+    """Return the seconds from the start to the first frame of a connected camera."""
     sockets = folder / "sockets"
     plug(sockets, [recording])
     source = RealsenseSource(RealsenseSourceConfig(serial=SERIAL), command(sockets))
@@ -249,7 +251,7 @@ async def started(recording: Path, folder: Path) -> float:
 
 
 def record(folder: Path) -> Path:
-    """Two seconds of a camera at 848x480."""
+    """Record two seconds of a camera at 848x480."""
     images = folder / "images"
     (images / "depth").mkdir(parents=True)
     columns = np.arange(WIDTH, dtype=np.uint16)
@@ -264,7 +266,7 @@ def record(folder: Path) -> Path:
 
 
 async def run(recording: Path, folder: Path, repeats: int) -> Result:
-    """Every fault, `repeats` times."""
+    """Run every fault `repeats` times."""
     starts = [await started(recording, folder) for _ in range(repeats)]
     outcomes = {name: [await flowing(fault, recording, folder) for _ in range(repeats)] for name, fault in FAULTS}
     outcomes["serial absent at the start, then there"] = [
@@ -294,9 +296,9 @@ def _row(name: str, outcomes: Sequence[Outcome]) -> tuple[str | float, ...]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run; exit code 1 when a mark is missed."""
-    parser = argparse.ArgumentParser(prog="make source-faults", description="What a camera in trouble costs.")
-    parser.add_argument("--repeats", type=int, default=3, help="of each fault (default 3)")
+    """Run. The exit code is 1 when a mark is missed."""
+    parser = argparse.ArgumentParser(prog="make source-faults", description="Measure the recovery of a failing camera.")
+    parser.add_argument("--repeats", type=int, default=3, help="repeats of each fault (default 3)")
     options = parser.parse_args(arguments)
     folder = Path(tempfile.mkdtemp(prefix="cellwatch-faults-"))
     try:

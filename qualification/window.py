@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The operator's window: its tests in a real browser, and what those who look cost the units."""
+"""The operator's window: its tests in a real browser, and the cost of viewers to the units."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ UNITS, RATE_HZ, VOXELS = 4, 15.0, 500
 """Voxels of each unit, so that a map has some 2,000."""
 
 SECONDS = 15.0
-"""Nine hundred updates, of which the p99 is the ninth from above."""
+"""Nine hundred updates, of which the p99 is the ninth largest."""
 
 TURNS = 3
 
@@ -38,7 +38,7 @@ RATIO_OF_ONE, RATIO_OF_TEN = 1.2, 2.0
 
 
 def run_tests(out: Path) -> dict[str, Any]:
-    """The browser's tests; pictures go to `out`."""
+    """Run the browser's tests. Screenshots go to `out`."""
     out.mkdir(parents=True, exist_ok=True)
     report, told = out / "report.xml", out / "browser.json"
     told.unlink(missing_ok=True)
@@ -61,7 +61,7 @@ def run_tests(out: Path) -> dict[str, Any]:
 
 
 async def measure(seconds: float, turns: int) -> dict[str, Any]:
-    """The round trip of an update with nobody, one and ten who look, in turns."""
+    """Measure the round trip of an update with no viewer, one and ten, in turns."""
     p99_ms: dict[int, list[float]] = {0: [], ONE: [], TEN: []}
     with tempfile.TemporaryDirectory(prefix="cellwatch-bench-") as scratch:
         folder = Path(scratch)
@@ -70,7 +70,7 @@ async def measure(seconds: float, turns: int) -> dict[str, Any]:
             for _ in range(turns):
                 for viewers, found in p99_ms.items():
                     found.append((await bench.at_rate(UNITS, VOXELS, viewers, RATE_HZ))["p99_ms"])
-    # Who else is busy on the machine only ever adds to it.
+    # Other load on the machine only ever adds to the time.
     best = {viewers: min(found) for viewers, found in p99_ms.items()}
     rows = [(viewers, *found, best[viewers], best[viewers] / best[0]) for viewers, found in p99_ms.items()]
     print(f"p99 of an update's round trip, ms: {UNITS} units of {VOXELS} voxels at {RATE_HZ:g}/s, by who looks")
@@ -84,12 +84,14 @@ async def measure(seconds: float, turns: int) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Test, measure, and print all of it as one line of JSON. Exit code 1 when anything fails or a mark is missed."""
+    """Test, measure, and print all figures as one line of JSON. The exit code is 1 when anything fails or a mark is
+    missed.
+    """
     parser = argparse.ArgumentParser(prog="make viewer-test", description=__doc__)
-    parser.add_argument("--out", type=Path, default=OUT, metavar="DIR", help=f"for pictures ({OUT})")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help=f"of each measurement ({SECONDS:g})")
-    parser.add_argument("--turns", type=int, default=TURNS, help=f"of the measurement ({TURNS})")
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="for window.json")
+    parser.add_argument("--out", type=Path, default=OUT, metavar="DIR", help=f"folder for screenshots ({OUT})")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help=f"duration of each measurement ({SECONDS:g})")
+    parser.add_argument("--turns", type=int, default=TURNS, help=f"turns of the measurement ({TURNS})")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help="folder for window.json")
     options = parser.parse_args(arguments)
     before = os.getloadavg()[0]
     found = run_tests(options.out)
@@ -102,14 +104,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     marks = [
         Mark("tests that failed", float(found["failed"]), at_most=0.0),
         Mark(
-            "update p99 with one who looks, times that with nobody",
+            "update p99 with one viewer, relative to none",
             found["update_p99_ratio_1_viewer"],
             at_most=RATIO_OF_ONE,
-            why=f"with nobody it is {found['update_p99_ms']:.2f} ms; master and window share one core, those who look "
-            "and the load the other: an update that comes while the window asks, ten times a second, waits for it",
+            why=f"without a viewer it is {found['update_p99_ms']:.2f} ms; master and window share one core, viewers "
+            "and load the other: an update that comes during a request of the window, ten times a second, waits for it",
         ),
         Mark(
-            "update p99 with ten who look, times that with nobody",
+            "update p99 with ten viewers, relative to none",
             found["update_p99_ratio_10_viewers"],
             at_most=RATIO_OF_TEN,
         ),

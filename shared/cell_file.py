@@ -231,7 +231,7 @@ def named_file(cell_file: Path, key: str, text: str) -> Path:
     where = f"{cell_file}: {key}"
     found = _named(cell_file, where, text)
     if not found.is_file():
-        raise CellError(f"{where}: expected a file, got {'a folder' if found.is_dir() else 'nothing'} at {found}")
+        raise CellError(f"{where}: expected a file at {found}, found {'a folder' if found.is_dir() else 'none'}")
     return found
 
 
@@ -244,7 +244,7 @@ def named_folder(cell_file: Path, key: str, text: str) -> Path:
     where = f"{cell_file}: {key}"
     found = _named(cell_file, where, text)
     if not found.is_dir():
-        raise CellError(f"{where}: expected a folder, got {'a file' if found.is_file() else 'nothing'} at {found}")
+        raise CellError(f"{where}: expected a folder at {found}, found {'a file' if found.is_file() else 'none'}")
     return found
 
 

@@ -217,7 +217,7 @@ def load_mesh(path: str | Path, scale: float | Sequence[float] = 1.0, name: str 
     if file.suffix.lower() not in FILE_SUFFIXES:
         raise MeshError(f"{file}: expected a mesh file ({', '.join(FILE_SUFFIXES)}), got {file.suffix or file.name!r}")
     if not file.is_file():
-        raise MeshError(f"{file}: expected a mesh file, got {'a folder' if file.is_dir() else 'nothing there'}")
+        raise MeshError(f"{file}: expected a mesh file, got {'a folder' if file.is_dir() else 'no such file'}")
     try:
         with file.open("rb") as opened:
             start = opened.read(len(_LFS_POINTER))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every test stands on: recorded data, and guards that no test leaves anything running."""
+"""Basis of all tests: recorded data, and guards against running leftovers."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from tests.missing import missing
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 SLOW_TIMEOUT_S = 600
-# What was told to stop may need a moment; what nobody told to stop outlives any moment.
+# A stopping process may need a moment; a forgotten one outlives any moment.
 GRACE_S = 3.0
-# Real processes, whose times others' load would disturb, but for tests that are marked `patient`.
+# Real processes, whose times suffer from other load, but for tests that are marked `patient`.
 ALONE = CHECKOUT / "tests" / "system"
-# A blocking call stalls every other unit's updates, so async code of the daemons may make none.
+# A blocking call delays every other unit's updates, so async code of the daemons may not make one.
 EVENT_LOOP_TESTS = tuple(CHECKOUT / "tests" / package for package in ("edge_unit", "master_server"))
 EVENT_LOOP_CODE = ("shared", "edge_unit", "master_server")
-# But for the rare change that must be on the disk before anything else happens; its docstring tells why.
+# Except for the rare change that must be on the disk before anything else happens; its docstring gives the reason.
 STORE_BLOCKS = {"in_memory", "load", "_transaction", "_put", "_put_cell", "_drop_meshes", "save_units"}
 
-# A busy machine is no fault of an example; where CI is set, hypothesis draws the same ones each time by itself.
+# A busy machine is no fault of an example. With CI set, hypothesis draws the same examples each time by itself.
 settings.register_profile("patient", settings(), deadline=None)
 settings.load_profile("patient")
 
@@ -44,9 +44,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def data_dir() -> Iterator[Path]:
-    """Folder of the recorded data sets; `$CELLWATCH_DATA` names it while the session lasts.
+    """Yield the folder of the recorded data sets. `$CELLWATCH_DATA` names it during the session.
 
-    Without the data a test is skipped, except where CI is set: there it fails.
+    Without the data a test is skipped; with CI set it fails.
     """
     folder = Path(os.environ.get("CELLWATCH_DATA") or CHECKOUT.parent / "shared" / "data").resolve()
     if not folder.is_dir():
@@ -58,7 +58,9 @@ def data_dir() -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def roots() -> Path:
-    """Root file systems of a unit and a master, which `.ci/run` has made before the tests, for these fetch nothing."""
+    """Return the root file systems of a unit and a master. `.ci/run` makes them before the tests, because tests fetch
+    nothing.
+    """
     if (reason := why_not()) is not None:
         pytest.skip(f"no machines can be run here: {reason}")
     folder = Path(os.environ.get("CELLWATCH_ROOTS", CHECKOUT / "out" / "rehearsal"))
@@ -72,7 +74,7 @@ def _threads() -> set[threading.Thread]:
 
 
 def _children() -> set[psutil.Process]:
-    """All processes below this one, but for the one that Python keeps for shared memory."""
+    """Return all child processes, except the one that Python keeps for shared memory."""
     tracker = getattr(resource_tracker._resource_tracker, "_pid", None)
     return {child for child in psutil.Process().children(recursive=True) if child.pid != tracker}
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a test needs and this machine has not."""
+"""Requirements of a test that this machine lacks."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def missing(reason: str) -> NoReturn:
 
 
 def need_command(command: str, package: str) -> None:
-    """A command that no wheel brings, and the package of the distribution that does."""
+    """Require a command that no wheel brings; `package` is the package of the distribution."""
     if shutil.which(command) is None:
         missing(f"there is no {command} here (apt-get install {package})")
 
 
 def need_namespaces() -> None:
-    """Networks of its own, in which a test may do what it likes."""
+    """Require private networks, in which a test may do anything."""
     need_command("ip", "iproute2")
     if not any(allowed(unshare) for unshare in NAMESPACES):
         missing("the kernel allows no namespaces here")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files of the project: what git knows of, or all that lies there where there is no git or no repository."""
+"""Files of the project: those that git tracks, or all files if there is no git or no repository."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 
 NO_SOURCE = {".git", ".venv", "__pycache__", "build", "dist", "out", "state"}
-"""Folders that runs leave; `.gitignore` names them, too, and caches begin with a dot."""
+"""Folders that runs leave. `.gitignore` names them, too; caches begin with a dot."""
 
 
 def project_files(root: Path) -> list[Path]:

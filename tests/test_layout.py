@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shape of the project: listings tell the flow, imports follow it, nothing names a machine."""
+"""Structure of the project: listings give the flow, imports follow it, and no file names a machine."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ KERNELS = ("geometry", "kernels")
 KERNEL_IMPORTS = {"__future__", "collections", "math", "numba", "numpy", "typing"}
 CLOCK = ("shared", "clock")
 MODULES_MAX = 16
-"""In a folder; more are rooms that nobody has named yet."""
+"""Modules in a folder. A folder with more needs subfolders."""
 LARGE = {("shared",), KERNELS}
-"""Folders that may hold more: what both sides agree on is one list, and so is the arithmetic."""
+"""Folders that may hold more: the shared contract is one list, and so are the kernels."""
 BEFORE_SETTLED = (("geometry",), ("geometry", "compilation"))
-"""Imported before the folder of compiled kernels is settled: whatever they re-exported would be defined too early."""
+"""Imported before the folder of compiled kernels is settled, so their re-exports would be defined too early."""
 MIRRORED = PACKAGES
 """Packages whose tests lie in folders of the same names."""
 WALL_CLOCK_CALLS = {"now", "utcnow", "today"}
 LISTED = re.compile(r"^ {4}(\w+/?) +\S", re.MULTILINE)
-# In brackets, so that this page does not find itself.
+# In brackets, so that this file does not match itself.
 MACHINE = re.compile(
     r"(?<![\w.$}])/(?:(?:[h]ome|[U]sers)/\w|[r]oot/)"
     r"|[p]ypi\.org|python[h]osted|[n]pmjs\.(?:org|com)|deb\.[d]ebian\.org"
@@ -47,14 +47,14 @@ Check = Callable[[Path], Iterator[str]]
 
 
 def listing(package: Path) -> list[str]:
-    """Names of a package's modules as its docstring lists them; sub-packages end in a slash."""
+    """Return the names of a package's modules as its docstring lists them; sub-packages end in a slash."""
     source = package / "__init__.py"
     tree = ast.parse(source.read_text()) if source.is_file() else ast.Module([], [])
     return LISTED.findall(ast.get_docstring(tree, clean=False) or "")
 
 
 def modules(root: Path) -> Iterator[tuple[Path, Module]]:
-    """Every Python file of the packages and its dotted name; an `__init__` has that of its folder."""
+    """Yield every Python file of the packages and its dotted name; an `__init__` has that of its folder."""
     for package in PACKAGES:
         for file in sorted((root / package).rglob("*.py")):
             parts = file.relative_to(root).with_suffix("").parts
@@ -62,7 +62,7 @@ def modules(root: Path) -> Iterator[tuple[Path, Module]]:
 
 
 def imports(file: Path, module: Module) -> Iterator[tuple[int, Module]]:
-    """Line and dotted name of all that a file imports, at its top or inside a function."""
+    """Yield line and dotted name of every import of a file, at its top or inside a function."""
     for node in ast.walk(ast.parse(file.read_text(), str(file))):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, tuple(alias.name.split("."))) for alias in node.names)
@@ -74,7 +74,7 @@ def imports(file: Path, module: Module) -> Iterator[tuple[int, Module]]:
 
 
 def check_listings(root: Path) -> Iterator[str]:
-    """Each package's docstring lists exactly the modules that it has."""
+    """Check that each package's docstring lists exactly its modules."""
     folders = {folder for file, _ in modules(root) for folder in file.parents if folder.is_relative_to(root)}
     for folder in sorted(folders - {root}):
         listed = listing(folder)
@@ -87,7 +87,7 @@ def check_listings(root: Path) -> Iterator[str]:
 
 
 def check_order(root: Path) -> Iterator[str]:
-    """No module imports one that is listed below it."""
+    """Check that no module imports one that is listed below it."""
     for file, module in modules(root):
         for line, target in imports(file, module):
             same = next((i for i, (a, b) in enumerate(zip(module, target, strict=False)) if a != b), 0)
@@ -102,7 +102,9 @@ def check_order(root: Path) -> Iterator[str]:
 
 
 def check_packages(root: Path) -> Iterator[str]:
-    """Units and master never import each other, what both share imports neither, and no package a reader's."""
+    """Check that units and master never import each other, shared packages import neither, and no package imports a
+    reader's.
+    """
     for file, module in modules(root):
         for line, target in imports(file, module):
             if target[0] in {*PACKAGES, "tests"} - WALLS[module[0]] - {module[0]}:
@@ -110,7 +112,7 @@ def check_packages(root: Path) -> Iterator[str]:
 
 
 def check_size(root: Path) -> Iterator[str]:
-    """No folder holds more modules than a reader can keep in mind."""
+    """Check that no folder holds too many modules."""
     folders: dict[Module, int] = {}
     for file, module in modules(root):
         if file.name != "__init__.py":
@@ -121,7 +123,9 @@ def check_size(root: Path) -> Iterator[str]:
 
 
 def check_re_exports(root: Path) -> Iterator[str]:
-    """A page re-exports what its own room has; no module takes from its room's page what lies beside it."""
+    """Check that a package re-exports only its own names, and that a module does not import a sibling through its
+    package.
+    """
     for file, module in modules(root):
         room = module if file.name == "__init__.py" else module[:-1]
         for line, target in imports(file, module):
@@ -136,7 +140,7 @@ def check_re_exports(root: Path) -> Iterator[str]:
 
 
 def check_mirror(root: Path) -> Iterator[str]:
-    """Tests lie in folders that are called like those that they test."""
+    """Check that tests lie in folders named after those that they test."""
     for package in MIRRORED:
         for folder in sorted({file.parent for file in (root / "tests" / package).rglob("test_*.py")}):
             tested = root / folder.relative_to(root / "tests")
@@ -145,7 +149,7 @@ def check_mirror(root: Path) -> Iterator[str]:
 
 
 def check_kernels(root: Path) -> Iterator[str]:
-    """Kernels are pure functions on arrays: no I/O, no clock, no configuration."""
+    """Check that kernels are pure functions on arrays: no I/O, no clock, no configuration."""
     for file, module in modules(root):
         for line, target in imports(file, module):
             if module[:2] == KERNELS and target[:2] != KERNELS and target[0] not in KERNEL_IMPORTS:
@@ -153,7 +157,7 @@ def check_kernels(root: Path) -> Iterator[str]:
 
 
 def check_clock(root: Path) -> Iterator[str]:
-    """The time is read in one module, so that all else can be tested without waiting."""
+    """Check that only one module reads the time, so that all others can be tested without waiting."""
     for file, module in modules(root):
         if module == CLOCK:
             continue
@@ -167,7 +171,7 @@ def check_clock(root: Path) -> Iterator[str]:
 
 
 def check_machine(root: Path) -> Iterator[str]:
-    """No file names a home folder or the host of a package registry."""
+    """Check that no file names a home folder or the host of a package registry."""
     for file in project_files(root):
         try:
             lines = file.read_text().splitlines()
@@ -270,7 +274,7 @@ EXPECTED: dict[Check, list[str]] = {
 
 
 @pytest.mark.parametrize("check", CHECKS)
-def test_the_check_finds_what_is_wrong(check: Check, tmp_path: Path) -> None:
+def test_the_check_finds_every_fault(check: Check, tmp_path: Path) -> None:
     for name, text in BAD.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)

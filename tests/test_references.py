@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every name and path of the project that stands in a string, a unit file, a script or a page leads somewhere.
+"""Every name and path of the project in a string, a unit file, a script or a page exists.
 
-A module that moves leaves no error where only its name was written: a service that cannot start, a page that lies.
+A moved module causes no error where only its name is written: a service that cannot start, or a wrong page.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 PACKAGES = ("shared", "geometry", "edge_unit", "master_server", "simulation", "benchmarks", "qualification", "tests")
 PACKAGE = "|".join(PACKAGES)
 DOTTED = re.compile(rf"(?<![\w./@:-])(?:{PACKAGE})(?:\.[A-Za-z_]\w*)+")
-# Not `../shared/data`, which lies beside a checkout, nor what belongs to a longer path.
-FOLDERS = (*PACKAGES, "deploy", "assets", "docs", "scripts", r"\.ci")
+# Not `../shared/data`, which lies beside a checkout, nor a part of a longer path.
+FOLDERS = (*PACKAGES, "deploy", "assets", "docs", "examples", "scripts", r"\.ci")
 PATH = re.compile(rf"(?<![\w./<{{$*-])(?:{'|'.join(FOLDERS)})(?:/[\w.*-]+)+/?")
 RUN_AS_MODULE = re.compile(rf"""-m["']?[,\s]\s*["']?((?:{PACKAGE})(?:\.\w+)*)(?![\w.])""")
 IMPORTED = re.compile(rf"^[ >.]*from ((?:{PACKAGE})[\w.]*) import ([\w, ]+)$", re.MULTILINE)
@@ -40,12 +40,12 @@ WRITTEN_ELSEWHERE = (
 )
 """Made by a program, or about names that are wrong on purpose."""
 BESIDE = CHECKOUT.parent / "shared" / "data"
-"""Recorded data, which no checkout has."""
+"""Recorded data, which is in no checkout."""
 
 
 @cache
 def tracked() -> tuple[Path, ...]:
-    """Every text file of the project."""
+    """Return every text file of the project."""
     files = []
     for file in project_files(CHECKOUT):
         if file.relative_to(CHECKOUT).as_posix().startswith(WRITTEN_ELSEWHERE):
@@ -59,7 +59,7 @@ def tracked() -> tuple[Path, ...]:
 
 
 def texts(file: Path) -> Iterator[tuple[int, str]]:
-    """Line and text of what no interpreter checks: all of a page or script, strings of Python."""
+    """Yield line and text of everything that no interpreter checks: all of a page or script, strings of Python."""
     if file.suffix != ".py":
         yield 1, file.read_text(encoding="utf-8")
         return
@@ -69,7 +69,7 @@ def texts(file: Path) -> Iterator[tuple[int, str]]:
 
 
 def found(pattern: re.Pattern[str]) -> Iterator[tuple[str, re.Match[str]]]:
-    """Where `pattern` stands in any text, as `file:line`, and what it found."""
+    """Yield each match of `pattern` in any text, with its place as `file:line`."""
     for file in tracked():
         for first_line, text in texts(file):
             for match in pattern.finditer(text):
@@ -79,7 +79,7 @@ def found(pattern: re.Pattern[str]) -> Iterator[tuple[str, re.Match[str]]]:
 
 @cache
 def names_in(file: Path) -> frozenset[str]:
-    """All names that a module or a class in it binds, its imports included."""
+    """Return all names that a module or a class in it binds, including its imports."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
@@ -110,7 +110,7 @@ def leads_somewhere(dotted: str) -> bool:
 
 
 def can_be_run(dotted: str) -> bool:
-    """Return True if `python -m dotted` would find a module with something to run."""
+    """Return True if `python -m dotted` finds a module that can run."""
     place = CHECKOUT.joinpath(*dotted.split("."))
     file = place / "__main__.py" if place.is_dir() else place.with_suffix(".py")
     return file.is_file() and (file.name == "__main__.py" or "__main__" in file.read_text(encoding="utf-8"))
@@ -161,8 +161,8 @@ def test_every_import_in_a_string_or_a_page_can_be_made() -> None:
     assert not wrong, "\n".join(wrong)
 
 
-def test_every_path_from_a_module_s_own_place_is_there() -> None:
-    """`Path(__file__)` and what is reckoned from it; a module that moves takes its place along."""
+def test_every_path_relative_to_a_module_exists() -> None:
+    """`Path(__file__)` and paths derived from it: a moved module changes them."""
     reckoned = 0
     wrong = []
     for file in tracked():
@@ -203,7 +203,7 @@ def test_every_link_of_a_page_leads_somewhere() -> None:
     assert not wrong, "\n".join(wrong)
 
 
-def test_commands_and_wheel_name_what_is_there() -> None:
+def test_commands_and_wheel_name_existing_modules() -> None:
     tomllib = pytest.importorskip("tomllib", reason="Python 3.10 reads no TOML")
     project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))
     for command, entry in project["project"]["scripts"].items():
@@ -233,7 +233,7 @@ def test_commands_and_wheel_name_what_is_there() -> None:
         (RUN_AS_MODULE, "-m edge_unit.pipeline", False),
     ],
 )
-def test_what_is_wrong_is_found(pattern: re.Pattern[str], text: str, expected: bool) -> None:
+def test_wrong_names_are_found(pattern: re.Pattern[str], text: str, expected: bool) -> None:
     match = pattern.search(text)
     assert match is not None
     dotted = match[match.lastindex or 0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The size of what a reader must keep in mind: attributes of a class, parameters of a function."""
+"""Size of classes and functions: attributes of a class, parameters of a function."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 PACKAGES = ("edge_unit", "master_server")
 
 ATTRIBUTES_MAX = 15
-"""Of a class, its own: fields in its body and what its methods set. With more of them it is several classes."""
+"""Own attributes of a class: fields in its body and those that its methods set. A class with more should be split."""
 
 PARAMETERS_MAX = 10
-"""Of a function, besides `self` or `cls`; kernels lie in a package of their own."""
+"""Parameters of a function, besides `self` or `cls`. Kernels lie in a package of their own."""
 
 ALLOWED = {
     "edge_unit/config.py: UnitConfig": "one attribute for each name that may stand in a unit's configuration",
     "edge_unit/sources/realsense/capture_link.py: Opened": "what one process tells another once, field by field",
     "edge_unit/sources/realsense/capture_supervisor.py: CaptureSupervisor": "one process: its session and frames",
 }
-"""`file: name` of what is larger, and why."""
+"""`file: name` of larger classes and functions, and the reason."""
 
 
 def attributes(found: ast.ClassDef) -> set[str]:
-    """Fields in the body of a class, and what its own methods set of themselves."""
+    """Return the fields in the body of a class, and the attributes that its own methods set."""
     fields = [node for node in found.body if isinstance(node, ast.AnnAssign)]
     names = {
         node.target.id
@@ -49,13 +49,13 @@ def attributes(found: ast.ClassDef) -> set[str]:
 
 
 def parameters(found: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
-    """All that a function takes, but for the object that it is called on."""
+    """Return all parameters of a function except `self` or `cls`."""
     taken = (*found.args.posonlyargs, *found.args.args, *found.args.kwonlyargs)
     return [one.arg for one in taken if one.arg not in {"self", "cls"}]
 
 
 def too_large(root: Path) -> Iterator[tuple[str, str]]:
-    """`file: name` of all that is larger than it may be, and how large it is."""
+    """Yield `file: name` and the size of everything that exceeds its limit."""
     for file in sorted(file for package in PACKAGES for file in (root / package).rglob("*.py")):
         for node in ast.walk(ast.parse(file.read_text(), str(file))):
             if isinstance(node, ast.ClassDef):
@@ -72,7 +72,7 @@ def test_nothing_is_larger_than_a_reader_can_keep_in_mind() -> None:
     assert {name: size for name, size in too_large(CHECKOUT) if name not in ALLOWED} == {}
 
 
-def test_what_is_allowed_is_needed() -> None:
+def test_every_exception_is_needed() -> None:
     assert sorted(set(ALLOWED) - {name for name, _ in too_large(CHECKOUT)}) == []
 
 
@@ -93,7 +93,9 @@ TAKEN = ", ".join(f"p{n}" for n in range(PARAMETERS_MAX))
         (f"async def f({TAKEN}, q=1, *rest): ...", [("f", "11 parameters, at most 10")]),
     ],
 )  # fmt: skip
-def test_what_is_too_large_is_found(source: str, expected: list[tuple[str, str]], tmp_path: Path) -> None:
+def test_too_large_classes_and_functions_are_found(
+    source: str, expected: list[tuple[str, str]], tmp_path: Path
+) -> None:
     file = tmp_path / PACKAGES[0] / "one.py"
     file.parent.mkdir()
     file.write_text(source)

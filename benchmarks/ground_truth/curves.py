@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the trials found, as curves that explain themselves, as tables, and in words where we are the worse."""
+"""Curves that explain themselves, tables, and remarks on the figures in which our filter is worse."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ SHORT = {
     "tool_median_mm": "Median error at the tool",
     "tool_p99_mm": "99 % error at the tool",
 }
-"""Of the figures that are drawn, for titles: a picture's file is called by the beginning of its title."""
+"""Metrics that are drawn, with their titles. The file name of a plot begins with the title."""
 
 CEILING = "any pixel"
-"""A ceiling of what can be found, and nothing else."""
+"""An upper bound of what any filter can find. It is no filter by itself."""
 
 EVERYTHING = "all things"
 """The sum over all things of an axis."""
@@ -34,7 +34,7 @@ EVERYTHING = "all things"
 
 @dataclass(frozen=True)
 class Axis:
-    """What runs along the bottom of a curve."""
+    """Quantity on the x axis of a curve."""
 
     key: str
     label: str
@@ -45,7 +45,10 @@ class Axis:
 
 @dataclass(frozen=True)
 class Metric:
-    """What is drawn over it. `worse_by` is how much of a difference to a baseline is one; its sign says what is bad."""
+    """Quantity on the y axis of a curve.
+
+    `worse_by` is the smallest difference to a baseline that counts as worse. Its sign says which direction is bad.
+    """
 
     key: str
     label: str
@@ -57,7 +60,7 @@ class Metric:
 
 @dataclass(frozen=True)
 class Curve:
-    """One picture: `series` has for each contender its points (x, y), y being NaN where there is no figure."""
+    """One plot. `series` holds the points (x, y) of each contender; y is NaN if there is no figure."""
 
     axis: Axis
     metric: Metric
@@ -67,7 +70,7 @@ class Curve:
 
     @property
     def picture(self) -> Curves:
-        """For the page; on a logarithmic axis 0 is not drawn."""
+        """Return the curve for the page. A logarithmic axis does not draw 0."""
         is_false = self.metric.key == "false_per_1000"
         is_any = any(y > 0.0 for points in self.series.values() for _, y in points)
         return Curves(
@@ -79,7 +82,7 @@ class Curve:
         )
 
     def document(self) -> dict[str, Any]:
-        """As plain values: of each contender one y for each x, null where there is no figure."""
+        """Return plain values: for each contender one y per x, null if there is no figure."""
         at = sorted({x for points in self.series.values() for x, _ in points})
         return {
             "id": f"{self.axis.key}/{self.metric.key}/{self.subject}",
@@ -97,7 +100,7 @@ def _share(part: int, whole: int) -> float:
 
 
 def _quantile_mm(errors_m: list[float], share: float) -> float:
-    """An infinite one, where nothing was reported, is no figure."""
+    """Return a quantile in mm. An infinite quantile is no figure: nothing was reported."""
     if not errors_m:
         return math.nan
     error_m = float(np.quantile(errors_m, share, method="inverted_cdf"))
@@ -148,15 +151,15 @@ RECALLS = ("recall_percent", "recall_strict_percent", "lost_percent", "false_per
 ERRORS = ("tool_median_mm", "tool_p99_mm", "tool_p1_mm", "camera_median_mm", "camera_p99_mm", "camera_p1_mm")
 
 REASONS = (
-    "The halo of stereo makes things some 30 mm larger, and a voxel is counted as a cube: ours keeps the voxels at the "
-    "rim of a thing, and so shows it nearer than it is, by more than a rule that deletes them. Of a rule that loses "
-    "the thing in some frames, 99 % have no figure.",
-    "Close to what is known ours sees nothing within a margin that grows with noise; a fixed limit that is smaller "
-    "sees more there, and reports the noise of all that is farther away.",
-    "With the noise of a real camera at 3.5 m, which lies above the square law that ours reckons with, a wall in CAD "
-    "is not quite quiet.",
-    "Where the halo of a near thing covers a farther one the pixels show the near one: no rule finds what is not "
-    "measured, but one that takes five points may still find a few between.",
+    "The halo of stereo makes things some 30 mm larger, and a voxel counts as a cube. Ours keeps the"
+    " voxels at the rim of a thing, so it shows the thing nearer than it is, and nearer than a rule "
+    "that deletes these voxels. A rule that loses the thing in some frames has no figure for 99 %.",
+    "Close to a known surface ours sees nothing within a margin that grows with noise. A smaller "
+    "fixed limit sees more there, but reports the noise of everything farther away.",
+    "The noise of a real camera at 3.5 m lies above the square law of our margin, so a wall in CAD "
+    "gives a few false voxels.",
+    "The halo of a near thing can cover a farther one. Its pixels then show the near thing: no rule "
+    "finds unmeasured surfaces, but a rule of five points may still find a few points between.",
 )
 
 COMPARED = (
@@ -168,7 +171,7 @@ COMPARED = (
     "tool_p99_mm",
 )
 COMPARED_AXES = ("distance", "voxel", "stand-off", "wall", "quiet")
-"""Where a figure is the better or the worse, and x means the same for all."""
+"""Axes on which a figure can be better or worse, and x has the same meaning for all contenders."""
 
 AXES = {
     axis.key: axis
@@ -182,15 +185,17 @@ AXES = {
         ),
         Axis("points", "least points in a voxel", "points", RECALLS, "thing at 1.5 m, 50 mm voxels"),
         Axis(
-            "stand-off", "how far the front stands before the wall", "mm", RECALLS,
-            "an arm parallel to the wall, 50 mm voxels: what is closer to what is known than a margin is not seen",
+            "stand-off", "distance of the front from the wall", "mm", RECALLS,
+            "an arm parallel to the wall, 50 mm voxels: things closer to a known surface than the margin are"
+            " not seen",
         ),
         Axis(
-            "limit", "fixed offset before what is known", "mm", RECALLS,
-            "thing at 2.5 m, wall 1 m behind; ours reckons its own margin and is drawn over all of it",
+            "limit", "fixed offset before the known surface", "mm", RECALLS,
+            "thing at 2.5 m, wall 1 m behind; ours computes its own margin, and its line is drawn over all "
+            "of the axis",
         ),
         Axis("wall", "distance of the wall", "m", ("false_per_1000",), "a wall in CAD, square to the camera, alone"),
-        Axis("quiet", "camera of the demo cell", "number", ("false_per_1000",), "nothing but the robot moves"),
+        Axis("quiet", "camera of the demo cell", "number", ("false_per_1000",), "only the robot moves"),
     )
 }  # fmt: skip
 
@@ -202,13 +207,13 @@ class Collection:
         self._tallies: dict[tuple[str, str], dict[tuple[str, float], Tally]] = defaultdict(lambda: defaultdict(Tally))
 
     def add(self, subject: str, tallies: Tallies, in_sum: bool) -> None:
-        """Count what a trial found; `in_sum` also with `EVERYTHING`."""
+        """Count the tallies of one trial. With `in_sum` they also count for `EVERYTHING`."""
         for entry, tally in tallies:
             for name in (subject, EVERYTHING) if in_sum else (subject,):
                 self._tallies[entry.axis, name][entry.contender, entry.x].add(tally)
 
     def tally(self, axis: str, subject: str, contender: str, x: float | None = None) -> Tally:
-        """Of one point, or of all points of a line."""
+        """Return the tally of one point, or of all points of a line if `x` is None."""
         total = Tally()
         for (name, at), tally in self._tallies[axis, subject].items():
             if name == contender and x in (None, at):
@@ -216,7 +221,7 @@ class Collection:
         return total
 
     def curves(self) -> list[Curve]:
-        """All of them, in the order of the axes and of their metrics."""
+        """Return all curves, in the order of the axes and of their metrics."""
         found = []
         for axis in AXES.values():
             subjects = [name for key, name in self._tallies if key == axis.key]
@@ -238,7 +243,7 @@ class Collection:
 
 
 def tables(curves: Sequence[Curve], axis: str, metrics: Mapping[str, str], contenders: tuple[str, ...]) -> list[str]:
-    """Lines of a table of all subjects of an axis: a row each x, a column each of the `metrics` and contender."""
+    """Return the lines of a table of all subjects of an axis: one row per x, one column per metric and contender."""
     by_subject: dict[str, dict[str, Curve]] = defaultdict(dict)
     for curve in curves:
         if curve.axis.key == axis:
@@ -257,7 +262,7 @@ def tables(curves: Sequence[Curve], axis: str, metrics: Mapping[str, str], conte
 
 
 def by_thing(curves: Iterable[Curve], axis: str, metric: str, contender: str, things: Sequence[str]) -> Curves:
-    """One contender before all of the things, in one picture."""
+    """Return one contender's curves of all things in one plot."""
     drawn = {each.subject: each for each in curves if each.axis.key == axis and each.metric.key == metric}
     first = drawn[things[0]].picture
     title = first.title.removesuffix(things[0]) + contender
@@ -266,7 +271,9 @@ def by_thing(curves: Iterable[Curve], axis: str, metric: str, contender: str, th
 
 
 def worse(curves: Iterable[Curve], ours: str, others: tuple[str, ...]) -> Result:
-    """Every figure in which another contender is better than ours at the same x, with the places and the worst."""
+    """List every figure in which another contender is better than ours at the same x, with the number of places and the
+    worst one.
+    """
     rows: list[tuple[str | float, ...]] = []
     for curve in curves:
         if curve.axis.key not in COMPARED_AXES or curve.metric.key not in COMPARED or curve.subject == EVERYTHING:
@@ -284,11 +291,11 @@ def worse(curves: Iterable[Curve], ours: str, others: tuple[str, ...]) -> Result
                 figure = f"{curve.metric.label}, {curve.metric.unit}"
                 rows.append((other, figure, curve.subject, where, x, mine, theirs))
     columns = ("than", "in", "before", "at", "worst at", "ours", "theirs")
-    return Result("Where ours is the worse", columns, tuple(rows), remarks=REASONS)
+    return Result("Figures in which ours is worse", columns, tuple(rows), remarks=REASONS)
 
 
 def _is_worse(metric: Metric, mine: float, theirs: float) -> bool:
-    """A figure that is missing is the worst."""
+    """Return True if our figure is worse. A missing figure is the worst of all."""
     if math.isnan(theirs):
         return False
     if math.isnan(mine):
@@ -303,5 +310,5 @@ def _at(curve: Curve, contender: str, x: float) -> float:
 
 
 def _short(value: float) -> float | None:
-    """JSON knows no NaN; five digits are more than is known."""
+    """Round to five digits, more than the measurement is precise to. NaN becomes None, because JSON has no NaN."""
     return None if math.isnan(value) else float(f"{value:.5g}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who is compared, before what: the trials of every curve, and how many frames of each."""
+"""Contenders, scenes and numbers of frames: the trials of every curve."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from benchmarks.sweep_scenes.quiet import CAMERAS
 from shared.settings import FilterSettings
 
 NEAR_M = 1.5
-"""Where things stand while voxels and thresholds vary."""
+"""Distance of the things while voxel size and threshold vary."""
 
 BEHIND_M = 1.0
-"""The wall stands so far behind the things: beyond every margin."""
+"""Distance of the wall behind the things: beyond every margin."""
 
 LIMIT_AT_M = 2.5
-"""Where the arm stands while fixed limits vary: far enough for noise to matter."""
+"""Distance of the arm while fixed limits vary: far enough for noise to matter."""
 
 ARM = "arm 80 mm"
 STAND_OFFS = {f"{ARM} before a wall at {distance_m:g} m": distance_m for distance_m in (1.0, 2.5)}
@@ -41,13 +41,13 @@ SPECKLE = f"{BLOBS} wrong matches of up to 20 pixels a frame"
 WALL = "an empty wall"
 QUIET = "the demo cell, its robot moving alone"
 WALL_BOX_M = 0.5
-"""The cell's middle lies so far before an empty wall."""
+"""Distance from an empty wall to the cell's centre, towards the camera."""
 
 OURS, PAPER, POINTS, TUNED = "ours", "paper", "minimum points", "minimum points, tuned"
 BASELINES = (PAPER, POINTS, TUNED)
 
 TUNED_POINTS = 50
-"""As many as leave nothing false at `NEAR_M` with a wall a metre behind, and lose nothing."""
+"""Number that gives no false voxels at `NEAR_M` with a wall 1 m behind, and loses nothing."""
 CONTENDERS = {
     OURS: "the pipeline at its defaults: margins that grow with distance, the points of 27 voxels, the pinhole's count",
     PAPER: f"Algorithms 1, 6 and 7 as written: a fixed limit of {1e3 * LIMIT_M:.0f} mm before what is known, each "
@@ -60,7 +60,7 @@ CONTENDERS = {
 
 @dataclass(frozen=True)
 class Amount:
-    """How much of everything."""
+    """Number of frames, places and processes of a run."""
 
     frames: int = 50
     quiet_frames: int = 40
@@ -74,27 +74,27 @@ class Amount:
     limits_m: tuple[float, ...] = (0.03, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
     walls_m: tuple[float, ...] = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
     held_out: int = len(EMPTY_FRAMES)
-    """Empty real frames that are judged by what the others taught."""
+    """Number of empty real frames that are judged by a background model of the other empty frames."""
 
 
 QUICK = Amount(
     frames=2, quiet_frames=2, quiet_cameras=1, things=("rod 20 mm", ARM), distances_m=(1.0, 3.0), voxels_m=(0.02, 0.05),
     thresholds=(0.3, 0.6), points=(1, 5), stand_offs_m=(0.1, 0.3), limits_m=(0.05, 0.3), walls_m=(1.5,), held_out=0,
 )  # fmt: skip
-"""Little of everything: for tests."""
+"""A small amount of everything, for tests."""
 
 AnyTrial = Trial | QuietTrial
 
 
 def rules(settings: FilterSettings, ceiling: bool = True) -> dict[str, Rule]:
-    """The contenders at their defaults, by name."""
+    """Return the contenders at their defaults, by name."""
     compared: dict[str, Rule] = {OURS: Ours(settings), PAPER: Paper(), POINTS: MinimumPoints()}
     compared[TUNED] = MinimumPoints(points=TUNED_POINTS)
     return compared | ({CEILING: ANY_PIXEL} if ceiling else {})
 
 
 def _seed(subject: str, x: float) -> int:
-    """Another for each trial, and the same in every run."""
+    """Return a seed that differs between trials and is the same in every run."""
     return zlib.crc32(f"{subject} {x:g}".encode())
 
 
@@ -107,7 +107,7 @@ def over_distance(amount: Amount, settings: FilterSettings) -> Iterator[Trial]:
 
 
 def over_size(amount: Amount, settings: FilterSettings) -> Iterator[Trial]:
-    """Voxels and thresholds on the same frames of each thing, and thresholds before wrong matches."""
+    """Voxel sizes and thresholds on the same frames of each thing, and thresholds with wrong matches."""
     sizes = [
         Entry("voxel", name, 1e3 * size_m, rule, size_m)
         for size_m in amount.voxels_m
@@ -132,7 +132,7 @@ def over_size(amount: Amount, settings: FilterSettings) -> Iterator[Trial]:
 
 
 def over_stand_off(amount: Amount, settings: FilterSettings) -> Iterator[Trial]:
-    """An arm that comes closer to the wall."""
+    """An arm at decreasing distances from the wall."""
     radius_m = CYLINDERS[ARM][0]
     for subject, distance_m in STAND_OFFS.items():
         for front_m in amount.stand_offs_m:
@@ -144,7 +144,7 @@ def over_stand_off(amount: Amount, settings: FilterSettings) -> Iterator[Trial]:
 
 
 def over_limit(amount: Amount, settings: FilterSettings) -> Iterator[Trial]:
-    """The fixed limits of those who have one; ours reckons its own, and is drawn at both ends."""
+    """Limits of the rules with a fixed one. Ours computes its own limit, and is drawn at both ends."""
     entries = [
         Entry("limit", name, 1e3 * limit_m, rule)
         for limit_m in amount.limits_m
@@ -156,7 +156,7 @@ def over_limit(amount: Amount, settings: FilterSettings) -> Iterator[Trial]:
 
 
 def over_wall(amount: Amount, settings: FilterSettings) -> Iterator[Trial]:
-    """Nothing but a wall in CAD, square to the camera: whatever is reported is false."""
+    """A wall in CAD, square to the camera, and nothing else: every reported voxel is false."""
     for wall_m in amount.walls_m:
         entries = tuple(Entry("wall", name, wall_m, rule) for name, rule in rules(settings, False).items())
         distance_m, seed = wall_m - WALL_BOX_M, _seed(WALL, wall_m)
@@ -164,7 +164,7 @@ def over_wall(amount: Amount, settings: FilterSettings) -> Iterator[Trial]:
 
 
 def over_cameras(amount: Amount, settings: FilterSettings) -> Iterator[QuietTrial]:
-    """The demo cell with its robot alone."""
+    """The demo cell with only its robot."""
     for camera in range(amount.quiet_cameras):
         entries = tuple(Entry("quiet", name, camera, rule) for name, rule in rules(settings, False).items())
         yield QuietTrial(QUIET, camera, amount.quiet_frames, entries)

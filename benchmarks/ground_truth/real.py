@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The real recordings frame by frame: robot that is reported, second robot that is not, and voxels that are false.
+"""The real recordings frame by frame: reported robot pixels, missed pixels of the second robot, and false voxels.
 
-Frames with the second robot are judged by what was learned from the empty ones; each empty frame by what was learned
-from the other five, so that no frame has taught what it is held against. Margins are at their defaults.
+The frames with the second robot use a background model of the empty frames. Each empty frame uses a background model of
+the other five, so no frame is judged by a model that it contributed to. Margins are at their defaults.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Fixed = Mapping[str, Paper | MinimumPoints]
 
 @dataclass(frozen=True)
 class Judged:
-    """What one contender made of one frame."""
+    """Result of one contender on one frame."""
 
     contender: str
     frame: int
@@ -40,12 +40,12 @@ class Judged:
 
     @property
     def is_watched(self) -> bool:
-        """Whether the second robot stands there."""
+        """Return True if the frame shows the second robot."""
         return self.frame in WATCHED_FRAMES
 
 
 def watch(ours: str, others: Fixed, settings: FilterSettings, held_out: int) -> list[Judged]:
-    """Every frame before every contender; of the empty ones the first so many.
+    """Judge every frame by every contender, and the first `held_out` of the empty frames.
 
     Raises:
         SourceError: the recordings are not there.
@@ -82,7 +82,7 @@ def _learn(frames: RealFrames, taught: list[int]) -> None:
 
 
 def results(judged: list[Judged], ours: str) -> list[Result]:
-    """A row each frame and contender, and their distributions."""
+    """Return one row per frame and contender, and the distributions."""
     columns = ("contender", "frame", "robot reported %", "second robot missed %", "its voxels", "false voxels")
     rows: list[tuple[str | float, ...]] = []
     for each in judged:
@@ -90,8 +90,9 @@ def results(judged: list[Judged], ours: str) -> list[Result]:
         second = (found.second_robot_miss_percent, found.second_robot_voxels) if each.is_watched else (math.nan,) * 2
         rows.append((each.contender, each.frame, found.robot_leak_percent, *second, _false(each)))
     note = (
-        "Frames 0 to 3 show a second robot and are judged by what the empty ones taught, 4 to 9 are empty and judged "
-        "each by what the other five taught; all contenders share the learned background and the robot's mask.",
+        "Frames 0 to 3 show a second robot and use a background model of the empty frames. Frames 4 to 9"
+        " are empty, and each uses a background model of the other five. All contenders share the "
+        "background model and the robot mask.",
     )
     return [
         Result("Real frames, one by one", columns, tuple(rows), remarks=(*note, *remarks(judged, ours))),
@@ -103,7 +104,7 @@ def results(judged: list[Judged], ours: str) -> list[Result]:
 
 
 def marks(judged: list[Judged], ours: str) -> list[Mark]:
-    """Of our filter: robot over all frames, the rest over those that a whole background is held against."""
+    """Return our filter's marks: the robot over all frames, the rest over frames with a complete background model."""
     mine = [each for each in judged if each.contender == ours]
     leak = max(each.marks.robot_leak_percent for each in mine)
     miss = max(each.marks.second_robot_miss_percent for each in mine if each.is_watched)
@@ -116,7 +117,7 @@ def marks(judged: list[Judged], ours: str) -> list[Mark]:
 
 
 def remarks(judged: list[Judged], ours: str) -> list[str]:
-    """What a background of few frames makes false, and where others miss less."""
+    """List the false voxels that come of a background of few frames, and the figures in which others miss less."""
     mine = [each for each in judged if each.contender == ours]
     said = [
         f"Real frame {each.frame}, empty, by a background of the other five: {_false(each)} false voxels."
@@ -141,13 +142,13 @@ def remarks(judged: list[Judged], ours: str) -> list[str]:
 
 
 def _false(each: Judged) -> int:
-    """Where the second robot is gone its voxels would be false, too."""
+    """Return the number of false voxels. If the second robot is gone, its voxels are false, too."""
     found = each.marks
     return found.false_voxels + (0 if each.is_watched else found.second_robot_voxels)
 
 
 def _distributions(judged: list[Judged]) -> list[tuple[str, str, float, float, float]]:
-    """Contender, figure, median, 95 % and maximum over the frames."""
+    """Return contender, figure, median, 95 % and maximum over the frames."""
     found = []
     for name in dict.fromkeys(each.contender for each in judged):
         mine = [each for each in judged if each.contender == name]

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was reported of one frame, held against the surface that a perfect camera would have seen.
+"""Compares the reported voxels of one frame with the surface that a perfect camera would have seen.
 
-*Visible* is a voxel in which the true surface of the unknown thing shows at least
-`simulation.cameras.truth.VISIBLE_SHARE` of the pixels of a full one, `fx * fy * (size / z)²`. It is found *strictly*
-when it is reported itself, and *within a voxel* when it or one of its 26 neighbours is. What the camera did not
-measure, for it has holes and shadows, counts as missed.
+A voxel is *visible* if the true surface of the unknown thing covers at least `simulation.cameras.truth.VISIBLE_SHARE`
+of the pixels of a full voxel, `fx * fy * (size / z)²`, in it. A visible voxel is found *strictly* if it is reported
+itself, and *within a voxel* if it or one of its 26 neighbours is reported. Holes and shadows, which the camera does not
+measure, count as missed.
 
-*False* is a voxel whose middle lies farther from all of that surface than a voxel's diagonal and three standard
+A reported voxel is *false* if its centre is farther from all of that surface than a voxel's diagonal and three standard
 deviations of depth there.
 
-The *error of distance* is that of the nearest reported voxel, as a cube, less that of the nearest point of the true
-visible surface: below 0 the map shows the thing too near, above 0 too far. It is taken from the camera, and from where
-a tool may stand, `TOOL_M` beside the thing. When nothing is reported it is infinite.
+The *error of distance* is the distance of the nearest reported voxel, as a cube, less the distance of the nearest point
+of the true visible surface. Below 0 the map shows the thing too near, above 0 too far. The distance is taken from the
+camera, and from a possible place of a tool, `TOOL_M` beside the thing. The error is infinite if nothing is reported.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from simulation.cameras.truth import NOISE_SIGMAS, VISIBLE_SHARE, TruthFinder, h
 from simulation.world.scene import FIRST_UNKNOWN, View
 
 TOOL_M = 0.3
-"""How far a tool stands beside the thing, square to the line of sight."""
+"""Distance of the tool from the thing, perpendicular to the line of sight."""
 
 POINTS_MAX = 15_000
-"""Points of the surface that are kept for distances: a few millimetres apart on the largest thing."""
+"""Maximum number of surface points that are kept for distances: a few millimetres apart on the largest thing."""
 
 
 @dataclass
 class Tally:
-    """What came of a number of frames; errors in metres, one a frame."""
+    """Counts over a number of frames; errors in metres, one per frame."""
 
     frames: int = 0
     visible: int = 0
@@ -52,7 +52,7 @@ class Tally:
     camera_errors_m: list[float] = field(default_factory=list)
 
     def add(self, other: Tally) -> None:
-        """Count `other`'s frames, too."""
+        """Add `other`'s frames to these."""
         self.frames += other.frames
         self.visible += other.visible
         self.found += other.found
@@ -66,14 +66,14 @@ class Tally:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The true visible surface of the unknown things of one frame, none when nothing unknown is in sight.
+    """The true visible surface of the unknown things of one frame; empty if nothing unknown is in sight.
 
     Attributes:
-        view: what a perfect camera sees.
+        view: image of a perfect camera.
         points_m: (N, 3) in the world.
-        tolerance_m: (N,) three standard deviations of depth at each.
-        tree: of the points.
-        tool_m: (3,) where the tool stands.
+        tolerance_m: (N,) three standard deviations of depth at each point.
+        tree: search tree of the points.
+        tool_m: (3,) position of the tool.
     """
 
     view: View
@@ -84,7 +84,9 @@ class Surface:
 
     @classmethod
     def of(cls, view: View, place: Place, noise: DepthNoise, rng: np.random.Generator) -> Surface:
-        """Of what a perfect camera sees; `rng` decides on which side the tool stands, and which points are kept."""
+        """Make the surface from the view of a perfect camera. `rng` chooses the side of the tool and the points that
+        are kept.
+        """
         rows, columns = np.nonzero((view.owner >= FIRST_UNKNOWN) & np.isfinite(view.z_m))
         if len(rows) > POINTS_MAX:
             kept = np.sort(rng.choice(len(rows), POINTS_MAX, replace=False))
@@ -106,7 +108,7 @@ class Surface:
 
 
 class Judge:
-    """Holds what is reported on one lattice against the truth."""
+    """Compares the voxels reported on one lattice with the truth."""
 
     def __init__(self, place: Place, lattice: Lattice, noise: DepthNoise) -> None:
         self._place = place
@@ -115,7 +117,7 @@ class Judge:
         self._visible: tuple[Surface, NDArray[np.uint32]] | None = None
 
     def judge(self, surface: Surface, reported: NDArray[np.uint32]) -> Tally:
-        """One frame: keys (N,) that were reported, and the surface that was there."""
+        """Judge one frame: `reported` are the keys (N,) of the reported voxels, `surface` is the true surface."""
         lattice = self._lattice
         visible = self._visible_keys(surface)
         near = has_near(visible, reported, lattice, 1)
@@ -137,7 +139,7 @@ class Judge:
         return tally
 
     def _visible_keys(self, surface: Surface) -> NDArray[np.uint32]:
-        """Kept for the other contenders on the same frame."""
+        """Return the keys of the visible voxels. They are cached for the other contenders on the same frame."""
         if self._visible is None or self._visible[0] is not surface:
             self._visible = surface, self._finder.find(surface.view).visible_keys
         return self._visible[1]
@@ -158,6 +160,6 @@ class Judge:
 
 
 def visible_pixels_min(place: Place, voxel_size_m: float, distance_m: float) -> int:
-    """The N of "at least N pixels" for a voxel at that distance before the camera."""
+    """Return the N of "at least N pixels" for a voxel at that distance from the camera."""
     full = place.intrinsics.fx * place.intrinsics.fy * (voxel_size_m / distance_m) ** 2
     return max(math.ceil(VISIBLE_SHARE * full), 1)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stage askew to the lattice with a known wall on it, and things of known shapes that are put before that.
+"""A stage askew to the lattice with a known wall on it, and things of known shapes in front of the wall.
 
-No face of a voxel is parallel to the picture, so that no curve depends on how a flat thing happens to lie between two
+No face of a voxel is parallel to the image plane. So no curve depends on the position of a flat thing between two
 layers of voxels.
 """
 
@@ -23,16 +23,16 @@ from simulation.world.scene import Body, Capsules, Owner
 T_WORLD_CAMERA = from_xyz_rpy((0.37, -0.21, 1.13), (0.5, -0.35, 0.8))
 
 CELL_HALF_M = 1.2
-"""The cell is a cube about the thing: it holds a person with outstretched arms, and the wall a metre behind."""
+"""Half the edge of the cell, a cube about the thing. It holds a person with outstretched arms and a wall 1 m behind."""
 
 WALL_PER_M = 2.6
-"""Side of the wall for each metre of its distance: it fills the picture."""
+"""Side of the wall per metre of its distance: it fills the image."""
 
 PLACES_M, PLACES_PER_M = 0.25, 0.2
-"""Things stand within the first of the optical axis, and nearer to it before a near camera."""
+"""Things stand within the first value of the optical axis, and closer to it if the camera is near."""
 
 TILT_MAX_RAD = math.radians(60.0)
-"""From the picture's plane: a rod that points at the camera shows its end only."""
+"""Maximum tilt from the image plane. A rod that points at the camera shows only its end."""
 
 CYLINDERS = {"rod 10 mm": (0.005, 0.30), "rod 20 mm": (0.01, 0.30), "arm 80 mm": (0.04, 0.40)}
 """Radius and length in metres."""
@@ -48,11 +48,11 @@ _MESHES: dict[str, TriangleMesh] = {
 }
 _PERSON = Person(Loop((0.0, 0.0), 0.0, 1.0, 0.5))
 _UPRIGHT = np.array(((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)))
-"""Turns a body whose z is up into the camera's frame, whose y is down."""
+"""Turns a body whose z axis points up into the camera's frame, whose y axis points down."""
 
 
 def before_wall(distance_m: float, behind_m: float, noise: DepthNoise, seed: int) -> Stage:
-    """A stage for a thing at `distance_m` (its middle), with a known wall `behind_m` farther."""
+    """Return a stage for a thing whose centre is at `distance_m`, with a known wall `behind_m` farther."""
     wall_m = distance_m + behind_m
     pose = T_WORLD_CAMERA @ from_xyz_rpy((0.0, 0.0, wall_m + 0.5 * SLAB_THICK_M), (0.0, 0.0, 0.0))
     wall = slab("wall", WALL_PER_M * (wall_m + SLAB_THICK_M), pose)
@@ -64,10 +64,10 @@ def before_wall(distance_m: float, behind_m: float, noise: DepthNoise, seed: int
 def placed(
     thing: str, distance_m: float, rng: np.random.Generator, tilt_max_rad: float = TILT_MAX_RAD
 ) -> tuple[Body, ...]:
-    """The thing of that name (see `THINGS`) at another place, turned another way each time.
+    """Return the thing of that name (see `THINGS`) at a random place and in a random orientation.
 
-    A cylinder's axis lies within `tilt_max_rad` of the picture's plane, boxes are turned in any way, a person stands
-    upright and is met anywhere on his way.
+    The axis of a cylinder lies within `tilt_max_rad` of the image plane. Boxes are turned in any way. A person stands
+    upright, anywhere on his way.
     """
     reach_m = min(PLACES_M, PLACES_PER_M * distance_m)
     middle = np.array((*rng.uniform(-reach_m, reach_m, 2), distance_m))
@@ -91,7 +91,7 @@ def _person(rng: np.random.Generator, middle: NDArray[np.float64]) -> tuple[Body
 
 
 def _any_turn(rng: np.random.Generator) -> NDArray[np.float64]:
-    """A rotation (3, 3), all equally likely."""
+    """Return a random rotation (3, 3), all equally likely."""
     matrix, triangle = np.linalg.qr(rng.standard_normal((3, 3)))
     matrix = matrix * np.sign(np.diag(triangle))
     return np.asarray(matrix if np.linalg.det(matrix) > 0.0 else -matrix)

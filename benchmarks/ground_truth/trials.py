@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All contenders before the same frames: a thing on the stage, blobs of wrong matches, a robot that moves alone."""
+"""Trials, in which all contenders get the same frames: a thing on the stage, blobs of wrong matches, a robot that moves
+alone.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +24,12 @@ from simulation.cameras.depth_noise import DepthNoise
 from simulation.world.world import World
 
 BLOB_NEAREST_M = 0.5
-"""Wrong matches lie at any depth from here to the wall."""
+"""Smallest depth of a wrong match; the largest is the wall's."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One point of one line: axis, contender, place on the axis, and the rule and voxels that make it."""
+    """One point of one line: axis, contender, x, and the rule and voxel size that produce it."""
 
     axis: str
     contender: str
@@ -39,14 +41,15 @@ class Entry:
 Tallies = list[tuple[Entry, Tally]]
 
 RobotMask = Callable[[NDArray[np.uint16], NDArray[np.float64] | None], NDArray[np.bool_]]
-"""From depth (H, W) and joints (n,) to the pixels (H, W) that are robot."""
+"""Maps depth (H, W) and joints (n,) to the robot mask (H, W)."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """`thing`, or nothing, at `distance_m` before a wall that is `behind_m` farther; in each frame so many `blobs`.
+    """`thing`, or nothing, at `distance_m` before a wall that is `behind_m` farther, with `blobs` wrong matches in each
+    frame.
 
-    `subject` is what the curves call it.
+    `subject` is the name of the scene in the curves.
     """
 
     subject: str
@@ -60,7 +63,7 @@ class Trial:
     blobs: int = 0
 
     def run(self) -> Tallies:
-        """What came of each entry."""
+        """Return the tally of each entry."""
         noise = DepthNoise()
         stage = before_wall(self.distance_m, self.behind_m, noise, self.seed)
         place = Place(stage.intrinsics, stage.T_world_camera, stage.cell)
@@ -79,7 +82,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class QuietTrial:
-    """The demo cell in which nothing but the robot moves, before one of its cameras: whatever is reported is false."""
+    """The demo cell, in which only the robot moves, seen by one of its cameras: every reported voxel is false."""
 
     subject: str
     camera: int
@@ -87,7 +90,7 @@ class QuietTrial:
     entries: tuple[Entry, ...]
 
     def run(self) -> Tallies:
-        """What came of each entry."""
+        """Return the tally of each entry."""
         world, intrinsics, noise = World.demo(people=0), d435i_intrinsics(), DepthNoise()
         place = Place(intrinsics, rig(world.cell, CAMERAS)[self.camera], world.cell)
         camera = SimulatedCamera(world, place.T_world_camera, intrinsics, noise, "raycast", self.camera)
@@ -104,7 +107,7 @@ class QuietTrial:
 
 
 class Contest:
-    """Several entries before one camera."""
+    """Several entries with the same camera."""
 
     def __init__(self, place: Place, entries: tuple[Entry, ...], noise: DepthNoise) -> None:
         self.tallies: Tallies = [(entry, Tally()) for entry in entries]
@@ -113,13 +116,15 @@ class Contest:
         self._judges = {size_m: Judge(place, place.cell.lattice(size_m), noise) for size_m in sizes_m}
 
     def hold(self, measured: Measured, surface: Surface) -> None:
-        """Judge what each of them reports of one frame."""
+        """Judge the voxels that each entry reports of one frame."""
         for (entry, tally), reported in zip(self.tallies, self._filters, strict=True):
             tally.add(self._judges[entry.voxel_size_m].judge(surface, reported(measured)))
 
 
 def robot_mask(place: Place, settings: FilterSettings) -> RobotMask:
-    """Finds the pixels that our padded robot explains: those that a filter takes out which knows the robot alone."""
+    """Return a mask function for the pixels that our padded robot explains: those that a filter with only the robot
+    removes.
+    """
     alone = replace(place.cell, static=(), objects=())
     pipeline = DepthPipeline(place.intrinsics, place.T_world_camera, alone, settings)
 
@@ -132,7 +137,7 @@ def robot_mask(place: Place, settings: FilterSettings) -> RobotMask:
 def _speckle(
     blobs: int, depth: NDArray[np.uint16], rng: np.random.Generator, farthest_m: float, camera: Intrinsics
 ) -> None:
-    """Put wrong matches of up to `SPECKLE_PX` pixels into `depth` (H, W), each at one depth of its own."""
+    """Add wrong matches of up to `SPECKLE_PX` pixels to `depth` (H, W), each at a depth of its own."""
     for _ in range(blobs):
         rows, columns = blob(rng, int(rng.integers(1, SPECKLE_PX + 1)), camera)
         depth[rows, columns] = round(rng.uniform(BLOB_NEAREST_M, farthest_m) / camera.depth_scale_m)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `make bench-latency` follows from camera to robot.
+"""Cameras and units of `make bench-latency`.
 
 In the order of the flow:
 
-    frames what simulated cameras see, rendered beforehand
-    unit   the edge unit before a camera that plays such frames
+    frames  renders the frames of the simulated cameras beforehand
+    unit    the edge unit with a camera that plays these frames
 """

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What simulated cameras see over one period of the robot, rendered beforehand: nobody renders while it is measured.
+"""Frames of simulated cameras over one period of the robot, rendered beforehand so that nothing renders during the
+measurement.
 
-`camera_phase_s` keeps the cameras apart, as nobody triggers those of a cell together.
+`camera_phase_s` keeps the cameras apart, because the cameras of a cell are not triggered together.
 """
 
 from __future__ import annotations
@@ -17,18 +18,18 @@ from simulation.world.world import World
 RING_HZ = 30.0
 
 PERIOD_S = RobotPath.demo().period_s
-"""After which the robot is where it was; people then jump, for which a filter does not care."""
+"""Period after which the robot repeats its motion. The people jump at that moment, which does not affect the filter."""
 
 FRAMES = round(PERIOD_S * RING_HZ)
 
 
 def camera_phase_s(camera: int, cameras: int) -> float:
-    """When, after the beginning of each period, a camera takes its first frame."""
+    """Return the time of a camera's first frame after the beginning of each period."""
     return camera / cameras / RING_HZ
 
 
 def prepare(path: Path, camera: int, cameras: int, size: tuple[int, int], frames: int = FRAMES) -> None:
-    """Render the ring of one camera, and leave it at `path` as (frames, H, W) uint16."""
+    """Render the ring of one camera and write it to `path` as (frames, H, W) uint16."""
     world = World.demo(people=1)
     eye = SimulatedCamera(world, rig(world.cell, cameras)[camera], d435i_intrinsics(*size), seed=camera)
     first_s = camera_phase_s(camera, cameras)

@@ -36,24 +36,24 @@ class RingSource:
 
     async def open(self) -> CameraInfo:
         """See `DepthSource`."""
-        # All of it in memory: a disk would be measured with it.
+        # All frames are in memory, because a disk would be part of the measurement.
         self._frames = await asyncio.to_thread(np.load, self._ring)
         config = self._config
         pose = rig(World.demo(people=0).cell, config.cameras)[config.camera]
         return CameraInfo(config.serial, "Played D435i", d435i_intrinsics(config.width, config.height), pose)
 
     async def frames(self) -> AsyncGenerator[DepthFrame, None]:
-        """See `DepthSource`. Who is slow skips."""
+        """See `DepthSource`. A slow consumer skips frames."""
         frames, config = self._frames, self._config
         if frames is None:
-            raise SourceError("played camera: expected to be opened before its frames are read")
+            raise SourceError("played camera: expected open() before frames(); call it first")
         period_ns = round(NS_PER_S / config.fps)
         stride = round(RING_HZ / config.fps)
         first_ns = config.epoch_ns + round(camera_phase_s(config.camera, config.cameras) * NS_PER_S)
         last = -1
         while True:
             latest = (monotonic_ns() - first_ns) // period_ns
-            # The one that was taken while the reader was busy, or else the next.
+            # The frame that was taken while the consumer was busy, or else the next one.
             last = latest if latest > last >= 0 else max(latest, last) + 1
             due_ns = first_ns + last * period_ns
             await asyncio.sleep(max(due_ns - monotonic_ns(), 0) / NS_PER_S)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who sends to a master and who reads from it, for `make bench-master`, `make bench-scale` and others.
+"""Simulated senders and readers of a master, for `make bench-master`, `make bench-scale` and others.
 
 In the order of the flow:
 
-    traffic      what units send, in the very bytes of their client
-    load         a process that sends it for many units, and counts
-    bare_fastapi what a master is measured against
-    map_readers  two robots that read the map, and when they had it
-    watchers     people who look at the master's viewer
-    merge_costs  what the merge itself costs, by the number of units
-    wide_master  a master that takes more units than it should
-    scale_load   more and more units before one master
+    traffic       the updates of units, in the very bytes of their client
+    load          a process that sends them for many units, and counts
+    bare_fastapi  the route that a master is compared with
+    map_readers   two robots that read the map and record the time of each map
+    watchers      viewers of the master's map, without browsers
+    merge_costs   the cost of the merge itself, by the number of units
+    wide_master   a master with a raised limit of units
+    scale_load    an increasing number of units for one master
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a master is measured against: a route of FastAPI that decodes an update into an array, and does no more."""
+"""The route that a master is compared with: FastAPI decodes an update into an array, and nothing more."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ app = FastAPI()
 
 @app.post("/update")
 async def update(request: Request) -> Response:
-    """Bytes to an array and back to bytes."""
+    """Decode bytes to an array and encode it back to bytes."""
     now_ns = monotonic_ns()
     keys = np.frombuffer(msgpack.unpackb(await request.body())["keys"], "<u4")
     answer = {"received_at_ns": now_ns, "answered_at_ns": monotonic_ns(), "voxels": len(keys)}
@@ -33,14 +33,14 @@ async def update(request: Request) -> Response:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve until told to stop."""
+    """Serve until terminated."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.load_generator.bare_fastapi")
     parser.add_argument("--ready-file", type=Path, required=True)
     options = parser.parse_args(arguments)
     listener = socket.create_server(("127.0.0.1", 0), backlog=256)
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     ready = {"url": f"http://127.0.0.1:{listener.getsockname()[1]}", "pid": os.getpid()}
-    # Whoever connects now waits until it is served.
+    # The socket listens from here on; connections wait in its backlog until they are served.
     write_whole(options.ready_file, json.dumps(ready).encode(), synced=False)
     config = uvicorn.Config(app, log_config=None, access_log=False, server_header=False, date_header=False)
     uvicorn.Server(config).run(sockets=[listener])

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Load for a master, from a process of its own: many units, one thread, plain sockets.
 
-`python -m benchmarks.load_generator.load PLAN RESULT` carries out the `Plan` in one file and leaves what came of it in
-another (JSON).
+`python -m benchmarks.load_generator.load PLAN RESULT` executes the `Plan` in one file and writes the figures to another
+(JSON).
 
-At a rate, the moments of sending are fixed beforehand, and a round trip counts from its moment however late it was
-really sent: a master that stalls is not spared the updates that would have come meanwhile. Without a rate each unit
-sends again as soon as it is answered.
+With a rate, the sending times are fixed beforehand, and a round trip counts from that time, even if the update was
+really sent later. So a master that stalls still gets the updates of that time. Without a rate each unit sends again as
+soon as it has its answer.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ from shared.settings import Settings
 from shared.wire import MEDIA_TYPE
 
 FRAME_RATE_HZ = 30.0
-"""Of the cameras: how far people walk from one update to the next."""
+"""Frame rate of the cameras. It sets the distance that people walk between two updates."""
 
 GRACE_S = 1.0
-"""After the last moment of sending; what is not acknowledged then is lost."""
+"""Time after the last sending time. An update that is not acknowledged by then is lost."""
 
 RECEIVE_BYTES = 65536
 TIMEOUT_S = 2.0
@@ -54,10 +54,10 @@ TIMEOUT_S = 2.0
 
 @dataclass(frozen=True)
 class Plan:
-    """What to do.
+    """Plan of one load.
 
-    `rate_hz` is that of each unit; None: as fast as answers come. `pid` is the server's, whose CPU time is
-    taken; `bare` that it is no master of ours.
+    `rate_hz` is the rate of each unit; None: as fast as answers come. `pid` is the process of the server, whose CPU
+    time is measured. `bare` says that the server is the bare route, not a master.
     """
 
     url: str
@@ -74,7 +74,7 @@ class Plan:
 
 @dataclass
 class Tally:
-    """What was counted: all updates in `sent` and `lost`, those after the warm-up in the rest."""
+    """Counts: `sent` and `lost` hold all updates, the other fields those after the warm-up."""
 
     sent: int = 0
     lost: int = 0
@@ -89,7 +89,7 @@ class Tally:
 
 
 class Connection:
-    """One unit's connection, kept open: one update under way, and the moments of those that wait behind it."""
+    """One unit's open connection: one update in flight, and the sending times of those that wait behind it."""
 
     def __init__(self, unit: SimpleUnit, server: tuple[str, int]) -> None:
         self.unit = unit
@@ -101,14 +101,14 @@ class Connection:
         self.socket = self._connect()
 
     def send(self, captured_at_ns: int) -> None:
-        """The update that is due next."""
+        """Send the next update."""
         self.due_ns = self.waiting.popleft()
         request, self.size_seen = self.unit.request(captured_at_ns, monotonic_ns())
         self.size_out = len(request)
         self.socket.sendall(request)
 
     def receive(self) -> tuple[int, int, bytes] | None:
-        """Status, bytes in all and body of an answer, once it is whole.
+        """Return status, total bytes and body of an answer once it is complete.
 
         Raises:
             ConnectionError: the other side closed the connection.
@@ -128,7 +128,7 @@ class Connection:
         return int(head.split(b" ", 2)[1]), size, body
 
     def again(self) -> None:
-        """Connect anew; what was under way is lost."""
+        """Reconnect. The update in flight is lost."""
         self.socket.close()
         self._received, self.due_ns = b"", None
         self.socket = self._connect()
@@ -149,7 +149,7 @@ class Generator:
         self.tally = Tally()
 
     def run(self) -> Tally:
-        """Send until the end, then wait for what is under way."""
+        """Send until the end, then wait for the updates in flight."""
         plan, tally = self._plan, self.tally
         begin_ns = monotonic_ns()
         self._count_from_ns = begin_ns + round(plan.warm_up_s * NS_PER_S)
@@ -194,18 +194,18 @@ class Generator:
         return tally
 
     def send_all(self) -> None:
-        """One more update from each unit, so that all of them are live."""
+        """Send one more update from each unit, so that all units are live."""
         for connection in self._connections:
             connection.waiting.clear()
             if connection.due_ns is not None:
-                # The answer to what is counted as lost must not be taken for that to this one.
+                # A late answer to an update that counts as lost must not be taken for the answer to this one.
                 connection.again()
             connection.waiting.append(monotonic_ns())
             connection.send(monotonic_ns() - AGE_NS)
             while (answer := connection.receive()) is None:
                 continue
             if answer[0] != http.client.OK:
-                raise MasterRefused(f"the master said {answer[0]}: {answer[2]!r}", answer[0])
+                raise MasterRefused(f"the master answered with status {answer[0]}: {answer[2]!r}", answer[0])
             connection.unit.take(answer[2], monotonic_ns())
 
     def close(self) -> None:
@@ -220,7 +220,7 @@ class Generator:
         return float(times.user + times.system)
 
     def _moments(self, begin_ns: int) -> list[tuple[int, int]]:
-        """When each unit sends first: cameras run freely, so at no particular moment of the others' period."""
+        """Return the time of each unit's first update. Cameras run freely, so it is a random moment of the period."""
         if self._plan.rate_hz is None:
             return [(begin_ns, number) for number in range(len(self._connections))]
         draw = random.Random(0)
@@ -261,7 +261,7 @@ class Generator:
 
 
 async def registered(plan: Plan, token: str) -> list[SimpleUnit]:
-    """The units, each at its own address, known to the master with their poses."""
+    """Register the units, each with its own address and a pose."""
     cell, settings = Cell.load(Path(plan.cell)), Settings()
     lattice, blocks = cell.lattice(settings.voxel_size_m), cell.lattice(settings.seen_block_size_m)
     views = [view(n, plan.voxels, lattice, blocks, FRAME_RATE_HZ) for n in range(min(plan.units, VIEWS))]
@@ -276,10 +276,10 @@ async def registered(plan: Plan, token: str) -> list[SimpleUnit]:
 
 
 async def register(unit: SimpleUnit, url: str, token: str) -> None:
-    """Make a unit known to the master, with a pose of its camera.
+    """Register one unit with the master, with a pose of its camera.
 
     Raises:
-        MasterRefused: it is one too many.
+        MasterRefused: the master takes no more units.
         UplinkError: the master does not answer.
     """
     async with MasterClient(url, lambda: token, unit.address) as client:
@@ -298,7 +298,7 @@ async def register(unit: SimpleUnit, url: str, token: str) -> None:
 
 
 def map_is_right(plan: Plan, token: str, units: list[SimpleUnit]) -> str:
-    """What is wrong with `GET /voxels`, held against what the units sent last; empty when nothing is."""
+    """Compare `GET /voxels` with the last updates of the units. Return the difference in words, or an empty text."""
     parts = urlsplit(plan.url)
     connection = http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=TIMEOUT_S)
     headers = {"Authorization": f"Bearer {token}", "Accept": MEDIA_TYPE}
@@ -316,7 +316,7 @@ def map_is_right(plan: Plan, token: str, units: list[SimpleUnit]) -> str:
 
 
 def carry_out(plan: Plan) -> dict[str, Any]:
-    """Do it; figures by name.
+    """Execute the plan and return the figures by name.
 
     Raises:
         CellwatchError: the master cannot be reached, or refuses the units.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two robots that read the map: one asks for it, one listens to the stream, and both note when they had it.
+"""Two robots that read the map: one polls it, one subscribes to the stream. Both record the time of each map.
 
-`python -m benchmarks.load_generator.map_readers URL TOKEN_FILE ASK_S RESULT` reads until told to stop, then leaves all
-that it noted in RESULT (JSON): a list of `Reading` by reader. It runs on the master's machine, whose clock is its own.
-A file RESULT with the suffix BEGUN is there as soon as both have had a map.
+`python -m benchmarks.load_generator.map_readers URL TOKEN_FILE POLL_S RESULT` reads until terminated, then writes
+RESULT (JSON): a list of `Reading` by reader. It runs on the master's machine and shares its clock. The file
+RESULT with the suffix BEGUN appears as soon as both readers have a map.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ ASKING, LISTENING = "GET /voxels", "WS /stream"
 BEGUN = ".begun"
 
 TIMEOUT_S = 2.0
-"""For one answer; a stream that is silent for twice its heartbeat is gone."""
+"""Timeout of one answer. A stream that is silent for twice its heartbeat counts as broken."""
 
 RETRY_S = 0.05
 
 
 class Reading(NamedTuple):
-    """One map. Times in ns: asked for (or, of a message, when the one before was done with), made, had, decoded."""
+    """Times of one map in ns: requested (for the stream: the end of the message before), made, received, decoded."""
 
     asked_ns: int
     made_ns: int
@@ -53,7 +53,7 @@ class Reading(NamedTuple):
 
 
 class Reader(threading.Thread):
-    """Reads until stopped; whoever does not answer is asked again."""
+    """Reads until stopped, and retries if the master does not answer."""
 
     def __init__(self, url: str, token: str) -> None:
         super().__init__(daemon=True)
@@ -76,7 +76,7 @@ class Reader(threading.Thread):
         """Read over one connection until stopped, or until it fails."""
 
     def _take(self, asked_ns: int, body: bytes) -> None:
-        """Make of it what a robot needs: an array of voxels."""
+        """Decode a map into what a robot needs: an array of voxels."""
         had_ns = monotonic_ns()
         answer: dict[str, Any] = ormsgpack.unpackb(body)
         voxels = np.array(answer["voxels"], np.int32).reshape(-1, 3)
@@ -88,12 +88,12 @@ class Reader(threading.Thread):
         self.begun.set()
 
 
-class Asking(Reader):
-    """Asks every `ask_s`, or as soon as it is answered when that takes longer."""
+class Poller(Reader):
+    """Polls every `poll_s`, or as soon as the answer has arrived if that takes longer."""
 
-    def __init__(self, url: str, token: str, ask_s: float) -> None:
+    def __init__(self, url: str, token: str, poll_s: float) -> None:
         super().__init__(url, token)
-        self.name, self._period_ns = ASKING, round(ask_s * NS_PER_S)
+        self.name, self._period_ns = ASKING, round(poll_s * NS_PER_S)
 
     def _read(self) -> None:
         host, _, port = self._netloc.partition(":")
@@ -111,8 +111,8 @@ class Asking(Reader):
                 self._take(asked_ns, body)
 
 
-class Listening(Reader):
-    """Takes each message of the stream."""
+class Subscriber(Reader):
+    """Receives each message of the stream."""
 
     def __init__(self, url: str, token: str) -> None:
         super().__init__(url, token)
@@ -130,20 +130,20 @@ class Listening(Reader):
 
 
 def read(path: Path) -> dict[str, list[Reading]]:
-    """What the readers noted."""
+    """Return the readings in a result file."""
     return {name: [Reading(*row) for row in rows] for name, rows in json.loads(path.read_text()).items()}
 
 
 def main() -> None:
-    """Read until told to stop."""
-    url, token, ask_s, result = sys.argv[1], Path(sys.argv[2]).read_text().strip(), float(sys.argv[3]), sys.argv[4]
+    """Read until terminated."""
+    url, token, poll_s, result = sys.argv[1], Path(sys.argv[2]).read_text().strip(), float(sys.argv[3]), sys.argv[4]
     stopped = threading.Event()
 
     def stop(number: int, frame: FrameType | None) -> None:
         stopped.set()
 
     signal.signal(signal.SIGTERM, stop)
-    readers = (Asking(url, token, ask_s), Listening(url, token))
+    readers = (Poller(url, token, poll_s), Subscriber(url, token))
     for reader in readers:
         reader.start()
     for reader in readers:

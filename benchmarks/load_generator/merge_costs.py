@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the merge itself costs in this process, by how many units there are: no network, no HTTP."""
+"""Cost of the merge itself in this process, by the number of units: no network, no HTTP."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ REPEATS = 100
 
 @dataclass(frozen=True)
 class MergeCost:
-    """Medians: a unit's report merged, the union of all made anew after it, and that written as a robot gets it."""
+    """Median times: to merge one unit's report, to rebuild the union of all after it, and to encode it for a robot."""
 
     units: int
     map_voxels: int
@@ -34,7 +34,7 @@ class MergeCost:
 
 
 def merge_costs(units: Sequence[int], voxels: int) -> Iterator[MergeCost]:
-    """One after the other, with people of so many voxels."""
+    """Measure one number of units after the other, with people of `voxels` voxels."""
     cell, settings = Cell.load(DEMO_CELL), Settings()
     lattice, blocks = cell.lattice(settings.voxel_size_m), cell.lattice(settings.seen_block_size_m)
     views = [view(n, voxels, lattice, blocks, FRAME_RATE_HZ) for n in range(VIEWS)]

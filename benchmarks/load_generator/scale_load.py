@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""More and more units before one master, from a process of its own.
+"""An increasing number of units for one master, from a process of its own.
 
-`python -m benchmarks.load_generator.scale_load PLAN RESULT` carries out the `ScalePlan` in one file, and adds a line of
-JSON to the other for each step: `Step`, or `{"units", "refused"}` where the master takes no more. Which frame the
-master had merged when goes to RESULT with the suffix `.UNITS-RATE.npz`.
+`python -m benchmarks.load_generator.scale_load PLAN RESULT` executes the `ScalePlan` in one file. For each step it
+appends a line of JSON to the other file: `Step`, or `{"units", "refused"}` if the master takes no more units. The merge
+times of the frames go to RESULT with the suffix `.UNITS-RATE.npz`.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from shared.errors import CellwatchError, MasterRefused
 from shared.settings import Settings
 
 STRIDE = 11
-"""Units that look through the same camera do so this many steps apart."""
+"""Steps between two units that share the view of one camera."""
 
 
 @dataclass(frozen=True)
 class ScalePlan:
-    """What to do: each of `units` at each of `rates_hz`, in this order. `pid` is the master's."""
+    """Plan: each of `units` at each of `rates_hz`, in this order. `pid` is the master's process."""
 
     url: str
     token_file: str
@@ -48,7 +48,7 @@ class ScalePlan:
 
 @dataclass(frozen=True)
 class Step:
-    """What so many units at this rate came to. Round trips count from when an update fell due."""
+    """Figures of one step. A round trip counts from the moment at which the update fell due."""
 
     units: int
     rate_hz: float
@@ -71,7 +71,7 @@ class Step:
 
 @dataclass(eq=False)
 class LoggingUnit(SimpleUnit):
-    """A unit that notes of each update: when its frame was taken, when the master had it, and when it had answered."""
+    """A unit that records three times of each update: frame taken, received by the master, answered by the master."""
 
     merged: list[tuple[int, int, int]] = field(default_factory=list)
     _captured_at_ns: int = 0
@@ -89,7 +89,7 @@ class LoggingUnit(SimpleUnit):
 
 
 def steps(plan: ScalePlan, result: Path) -> Iterator[dict[str, Any]]:
-    """Carry out one step after the other.
+    """Execute one step after the other.
 
     Raises:
         CellwatchError: the master cannot be reached.
@@ -155,7 +155,7 @@ def _step(plan: ScalePlan, token: str, units: list[LoggingUnit], rate_hz: float)
 
 
 def _waited_ns(pid: int) -> int:
-    """How long the process's main thread was ready to run and another had its core, so far."""
+    """Return the total time in ns for which the main thread was ready to run but had no core."""
     return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1])
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What units send: updates of people who walk, in the very bytes of the unit's own client."""
+"""Updates of units that see walking people, in the very bytes of the unit's own client."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from shared.timebase import Exchange
 from shared.wire import encode_update, keys_to_bytes, pack_seen
 
 FIRST_ADDRESS = IPv4Address("127.0.0.2")
-"""Of the first unit; 127.0.0.1 is the master's."""
+"""Address of the first unit; 127.0.0.1 is the master's."""
 
 WALK_RADIUS_M, WALK_M_PER_S = 0.75, 1.5
 """People walk in a circle in the middle of the cell."""
@@ -31,19 +31,19 @@ SLENDER = 3.5
 """A person's height in widths."""
 
 VIEWS = 8
-"""Cameras with a person before each; more units than that look through these at other moments."""
+"""Number of cameras with a person before each. Further units share these views at other moments."""
 
 CAMERA_RADIUS_M, CAMERA_ABOVE_M, CAMERA_HALF_ANGLE_RAD = 2.2, 1.2, math.radians(35.0)
 
 AGE_NS = 20_000_000
-"""From the capture of a frame to its update: exposure, transfer and filter."""
+"""Time from the capture of a frame to its update: exposure, transfer and filter."""
 
 LENGTH = b"Content-Length: "
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What one camera reports of a person who walks in a circle: keys, seen report and its bytes, by step."""
+    """One camera's reports of a person who walks in a circle: keys, seen report and its bytes, by step."""
 
     keys: tuple[bytes, ...]
     seen: tuple[SeenReport, ...]
@@ -51,7 +51,7 @@ class View:
 
 
 def view(number: int, voxels: int, lattice: Lattice, blocks: Lattice, rate_hz: float) -> View:
-    """View `number` of VIEWS, one step a frame of `rate_hz`; the person shows `voxels` voxels at any time."""
+    """Return view `number` of VIEWS, one step per frame of `rate_hz`. The person always has `voxels` voxels."""
     steps = round(2.0 * math.pi * WALK_RADIUS_M / WALK_M_PER_S * rate_hz)
     middle_m = np.asarray(lattice.origin_m) + 0.5 * lattice.voxel_size_m * np.asarray(lattice.shape)
     turn = 2.0 * math.pi * number / VIEWS
@@ -76,7 +76,7 @@ def view(number: int, voxels: int, lattice: Lattice, blocks: Lattice, rate_hz: f
 
 
 def _person(centre_m: NDArray[np.float64], voxels: int, lattice: Lattice) -> tuple[NDArray[np.uint32], float]:
-    """Keys of the `voxels` voxels nearest to a person, ascending, and half the person's width."""
+    """Return the keys of the `voxels` voxels nearest to a person, ascending, and half the person's width."""
     centre = (centre_m - lattice.origin_m) / lattice.voxel_size_m
     width = (3.0 * voxels / (4.0 * math.pi * SLENDER)) ** (1.0 / 3.0)
     axes = np.array((width, width, SLENDER * width))
@@ -91,7 +91,7 @@ def _person(centre_m: NDArray[np.float64], voxels: int, lattice: Lattice) -> tup
 
 
 def _behind(rays: NDArray[np.float64], person: NDArray[np.float64], width_m: float) -> NDArray[np.bool_]:
-    """Which of the `rays` (N, 3) from a camera end behind a `person`, seen from above."""
+    """Return a mask of the `rays` (N, 3) from a camera that end behind a `person`, seen from above."""
     flat, axis = rays[:, :2], person[:2] / np.linalg.norm(person[:2])
     beyond = flat @ axis > np.linalg.norm(person[:2])
     across = flat[:, 0] * axis[1] - flat[:, 1] * axis[0]
@@ -99,18 +99,18 @@ def _behind(rays: NDArray[np.float64], person: NDArray[np.float64], width_m: flo
 
 
 def _towards(angle_rad: float) -> NDArray[np.float64]:
-    """A horizontal direction."""
+    """Return a horizontal direction."""
     return np.array((math.cos(angle_rad), math.sin(angle_rad), 0.0))
 
 
 def address_of(number: int) -> str:
-    """The IP address of a unit on this machine."""
+    """Return the IP address of a unit on this machine."""
     return str(FIRST_ADDRESS + number)
 
 
 @dataclass(eq=False)
 class SimpleUnit:
-    """A unit that is nothing but its messages. Times are CLOCK_MONOTONIC, the master's own."""
+    """A unit that consists only of its messages. Times are CLOCK_MONOTONIC, the same clock as the master's."""
 
     address: str
     view: View
@@ -127,7 +127,7 @@ class SimpleUnit:
     _sent_at_ns: int = 0
 
     def request(self, captured_at_ns: int, now_ns: int) -> tuple[bytes, int]:
-        """The next update with its head, and how many bytes of it are the seen report."""
+        """Return the next update with its HTTP head, and the number of its bytes that are the seen report."""
         self.step = (self.step + 1) % len(self.view.keys)
         self.sequence += 1
         self.keys, self._sent_at_ns = self.view.keys[self.step], now_ns
@@ -156,7 +156,7 @@ class SimpleUnit:
         return with_head(self.head, encode_update(update)), self.view.seen_bytes[self.step] if changed else 0
 
     def take(self, body: bytes, now_ns: int) -> None:
-        """The master's answer to it."""
+        """Process the master's answer."""
         answer = msgpack.unpackb(body)
         self.exchange = Exchange(self._sent_at_ns, answer["received_at_ns"], answer["answered_at_ns"], now_ns)
         if joints := answer.get("joints"):
@@ -164,12 +164,12 @@ class SimpleUnit:
 
 
 def with_head(head: bytes, body: bytes) -> bytes:
-    """A whole request; `head` is that of `captured_head`."""
+    """Return a whole request; `head` is the result of `captured_head`."""
     return head % len(body) + body
 
 
 async def captured_head(url: str, token: str) -> bytes:
-    """The head of an update as the unit's client sends it to `url`, with `%d` for the length of the body."""
+    """Return the HTTP head of an update as the unit's client sends it to `url`, with `%d` for the body's length."""
     heads: list[bytes] = []
 
     async def record(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

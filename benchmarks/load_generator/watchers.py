@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""People who look at a master's viewer, without their browsers: each hears all that a browser would."""
+"""Viewers of a master's map, without browsers: each receives everything that a browser would."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from websockets.typing import Subprotocol
 
 WINDOW = "master_server.viewer.window"
 
-HEARD_MIN = 10
-"""Messages after which somebody has the whole cell before them."""
+MESSAGES_MIN = 10
+"""Number of messages after which a viewer has the whole cell."""
 
 CAMERA: dict[str, Any] = {
     "type": "ViewerCameraMessage",
@@ -33,11 +33,11 @@ CAMERA: dict[str, Any] = {
     "look_at": [0.0, 0.0, 0.0],
     "up_direction": [0.0, 0.0, 1.0],
 }
-"""What a browser says first."""
+"""First message of a browser."""
 
 
-async def watch(url: str, token: str, sees: asyncio.Event) -> None:
-    """Look until the end."""
+async def watch(url: str, token: str, ready: asyncio.Event) -> None:
+    """Receive until cancelled."""
     subprotocol = Subprotocol(f"viser-v{version('viser')}")
     address = f"{url.replace('http', 'ws', 1)}/viewer/"
     headers = {"Authorization": f"Bearer {token}"}
@@ -45,23 +45,23 @@ async def watch(url: str, token: str, sees: asyncio.Event) -> None:
         address, subprotocols=[subprotocol], additional_headers=headers, max_size=None, proxy=None
     ) as socket:
         await socket.send(msgpack.packb(CAMERA))
-        heard = 0
+        received = 0
         async for _ in socket:
-            heard += 1
-            if heard == HEARD_MIN:
-                sees.set()
+            received += 1
+            if received == MESSAGES_MIN:
+                ready.set()
 
 
 async def run(url: str, token_file: Path, master_pid: int, count: int, seeing: Path) -> None:
-    """Look `count` times over until told to stop; `seeing` is written once all see something."""
+    """Run `count` viewers until terminated. Write the file `seeing` once all of them have the cell."""
     token = token_file.read_text().strip()
-    sights = [asyncio.Event() for _ in range(count)]
-    tasks = [asyncio.ensure_future(watch(url, token, sees)) for sees in sights]
-    everyone = asyncio.ensure_future(asyncio.gather(*(sees.wait() for sees in sights)))
+    each_ready = [asyncio.Event() for _ in range(count)]
+    tasks = [asyncio.ensure_future(watch(url, token, ready)) for ready in each_ready]
+    everyone = asyncio.ensure_future(asyncio.gather(*(ready.wait() for ready in each_ready)))
     waited: list[asyncio.Future[Any]] = [everyone, *tasks]
     await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
     if everyone.done():
-        # The master has a core to itself in a benchmark; its viewer, a process of its own, may run where there is room.
+        # The master has a core to itself in a benchmark. Its viewer is a process of its own and may run on any core.
         for child in psutil.Process(master_pid).children():
             if WINDOW in child.cmdline():
                 child.cpu_affinity(list(range(os.cpu_count() or 1)))

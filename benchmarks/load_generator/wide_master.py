@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks.load_generator.wide_master`: a master that takes more units than it should."""
+"""`python -m benchmarks.load_generator.wide_master`: a master with a raised limit of units."""
 
 from __future__ import annotations
 

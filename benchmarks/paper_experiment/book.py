@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was measured, by contender, resolution, voxel size and number of cameras."""
+"""Measurements by contender, resolution, voxel size and number of cameras."""
 
 from __future__ import annotations
 
@@ -17,23 +17,25 @@ ONE_OCTREE = "centralised, as MoveIt's updaters"
 UNITS_SAME_FRAMES = "distributed, composed, all cameras with the same frames"
 
 CONTENDERS = {
-    UNITS_COMPOSED: "Each unit's work (process()) on a core of its own, then its update by the "
-    "units' own client over HTTP on loopback to a real master; the slowest counts. To it are added what the updates "
-    "of all units at the same moment take longer than one, and the master's merge.",
-    UNITS_RUNNING: "One process for each unit and one for the master, which share the cores of this machine: from "
-    "handing all units their frames at once until GET /voxels has brought a map that holds all of them.",
+    UNITS_COMPOSED: "Each unit's work (process()) on a core of its own, then its update by the units' own client "
+    "over HTTP on loopback to a real master; the slowest unit counts. Two times are added: the "
+    "additional time of all updates at the same moment compared with one, and the master's merge.",
+    UNITS_RUNNING: "One process for each unit and one for the master, which share the cores of this machine. The "
+    "time runs from handing all units their frames at once until GET /voxels returns a map that "
+    "holds all of them.",
     ONE_PROCESS: "The pipelines of all cameras in turn in one process on one core, and the master's own merge "
-    "there. In its favour: it finds the depth images in its memory, however they come there.",
+    "there. In its favour: the depth images are already in its memory.",
     ONE_PROCESS_BESIDE: "The same, measured in turns with the processes, not pinned to a core.",
     ONE_OCTREE: "All cameras in turn on one core: CAD and robot masked out of the depth image, points, "
-    "OctoMap.insertPointCloud with free-space rays (discretized) into one octree. In its favour: no rays to what is "
-    "CAD or robot, though MoveIt casts them, and nobody else locks the octree.",
-    UNITS_SAME_FRAMES: "As composed, but all cameras see what the first one sees, so that only their number changes.",
+    "OctoMap.insertPointCloud with free-space rays (discretized) into one octree. In its favour: no "
+    "rays to CAD and robot, which MoveIt casts, and no other user of the octree's lock.",
+    UNITS_SAME_FRAMES: "As composed, but all cameras have the frames of the first one, so that only their number "
+    "changes.",
 }
 
 
 class Key(NamedTuple):
-    """Which measurement."""
+    """Identifies one measurement."""
 
     contender: str
     resolution: str
@@ -43,7 +45,7 @@ class Key(NamedTuple):
 
 @dataclass(frozen=True)
 class Spread:
-    """Milliseconds of several refreshes."""
+    """Statistics in milliseconds over several refreshes."""
 
     median_ms: float
     p99_ms: float
@@ -53,13 +55,13 @@ class Spread:
 
 
 class Book:
-    """Collects milliseconds."""
+    """Collects the times of refreshes in milliseconds."""
 
     def __init__(self) -> None:
         self._samples: dict[Key, list[float]] = {}
 
     def add(self, contender: str, resolution: str, voxel_size_m: float, until_ms: Iterable[float]) -> None:
-        """What refreshes of one camera, two, and so on took in one round."""
+        """Add the times of one round: the refresh of one camera, of two, and so on."""
         for cameras, value in enumerate(until_ms, 1):
             self._samples.setdefault(Key(contender, resolution, in_mm(voxel_size_m), cameras), []).append(value)
 
@@ -67,26 +69,26 @@ class Book:
         return key in self._samples
 
     def spread(self, key: Key) -> Spread:
-        """What was measured under `key`.
+        """Return the statistics of `key`.
 
         Raises:
-            KeyError: nothing was.
+            KeyError: nothing was measured.
         """
         values = self._samples[key]
         median, p99 = np.percentile(values, (50, 99))
         return Spread(float(median), float(p99), min(values), max(values), len(values))
 
     def median(self, contender: str, resolution: str, voxel_mm: int, cameras: int) -> float:
-        """In milliseconds; NaN where nothing was measured."""
+        """Return a median in milliseconds; NaN if nothing was measured."""
         key = Key(contender, resolution, voxel_mm, cameras)
         return self.spread(key).median_ms if key in self else float("nan")
 
     def __iter__(self) -> Iterator[Key]:
-        """All measurements, in the order in which they were begun."""
+        """Iterate over all measurements, in the order in which they were begun."""
         return iter(self._samples)
 
     def rows(self) -> list[dict[str, Any]]:
-        """All of it as plain values."""
+        """Return all measurements as plain values."""
         found = []
         for key in self._samples:
             spread = self.spread(key)
@@ -96,5 +98,5 @@ class Book:
 
 
 def in_mm(voxel_size_m: float) -> int:
-    """A voxel's edge as people say it."""
+    """Return a voxel's edge in whole millimetres."""
     return round(1e3 * voxel_size_m)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a refresh would take if each unit had a computer of its own, in turns with the centralised ways.
+"""A refresh composed as if each unit had a computer of its own, in turns with the centralised ways.
 
-The parts of it are measured one at a time, so that two cores can tell what five computers would do.
+Its parts are measured one at a time, so two cores are enough to predict five computers.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from shared.errors import UplinkError
 from shared.wire import encode_update
 
 OCTREE_S = 15.0
-"""For one resolution and voxel size: no further refresh of the octree is begun after it, for one may take seconds."""
+"""Per resolution and voxel size: no further refresh of the octree begins after it, because one may take seconds."""
 
 
 @dataclass(eq=False)
 class Parts:
-    """Of what the refreshes of one resolution and voxel size consist: (rounds, cameras) milliseconds each, and bytes.
+    """Parts of the refreshes of one resolution and voxel size: (rounds, cameras) milliseconds each, and bytes.
 
     Attributes:
         unit_ms: a unit's work on its frame.
         trip_ms: its update, by its client, there and back.
         rush_ms: updates of so many units at once, until the last is answered.
-        merge_ms: merging the voxels of so many units, which the master does when it is asked next.
-        map_ms: a robot's GET /voxels of so many units; no part of a refresh, for whoever works centrally pays it, too.
-        update_bytes: of the units' updates.
+        merge_ms: merge of the voxels of so many units, which the master does at the next request.
+        map_ms: a robot's GET /voxels of so many units. No part of a refresh, because the centralised ways pay it, too.
+        update_bytes: size of the units' updates.
     """
 
     resolution: str
@@ -51,17 +51,17 @@ class Parts:
     voxels: list[int] = field(default_factory=list)
 
     def refresh_ms(self) -> NDArray[np.float64]:
-        """The refreshes (rounds, cameras) of one camera, two, and so on."""
+        """Return the refreshes (rounds, cameras) of one camera, two, and so on."""
         slowest = np.maximum.accumulate(np.array(self.unit_ms) + np.array(self.trip_ms), axis=1)
         return np.asarray(slowest + self.waited_ms() + np.array(self.merge_ms))
 
     def waited_ms(self) -> NDArray[np.float64]:
-        """How much longer (rounds, cameras) so many updates at once take than one."""
+        """Return the additional time (rounds, cameras) of so many simultaneous updates compared with one."""
         rush = np.array(self.rush_ms)
         return np.asarray(np.maximum(rush - rush[:, :1], 0.0))
 
     def alone_ms(self) -> NDArray[np.float64]:
-        """The refreshes (rounds, cameras) of each camera, were it the only one."""
+        """Return the refreshes (rounds, cameras) of each camera as if it were the only one."""
         return np.asarray(np.array(self.unit_ms) + np.array(self.trip_ms) + np.array(self.merge_ms)[:, :1])
 
 
@@ -69,14 +69,14 @@ class Bench:
     """One resolution before a master."""
 
     def __init__(self, site: Site, views: Views, name: str, book: Book) -> None:
-        """Refreshes are written down in `book` under `name`."""
+        """Record the refreshes in `book` under `name`."""
         self._site, self._views, self._name, self._book = site, views, name, book
         self._work = prepared(views, 0.05)
         self._centralised = Centralised(self._work)
         self._members = [Member.at(site.url, site.unit_token, number) for number in range(CAMERAS)]
 
     async def run(self, sizes_m: Sequence[float], rounds: int, octree_rounds: Mapping[float, int]) -> list[Parts]:
-        """So many rounds for each voxel size, in some of them also the octree; returns of what they consist."""
+        """Run `rounds` rounds for each voxel size, in some of them also the octree. Return the parts of each size."""
         found = []
         for member in self._members:
             await member.client.__aenter__()
@@ -99,14 +99,14 @@ class Bench:
             octree.resize(size_m)
         parts = Parts(views.name, in_mm(size_m))
         self._merged = MergedMap(self._work[0].pipeline.lattice)
-        # As the daemon does: what is there now stays, and is not looked through again.
+        # As in the daemon, existing objects are exempt from garbage collection.
         gc.collect()
         gc.freeze()
         with (
             closing(MapReader(site.url, site.unit_token)) as reader,
             closing(Rush(site.url, site.head, self._members)) as rush,
         ):
-            # Compiles what is not yet: it would take longer than the master waits for anyone to say something.
+            # Compiles the missing kernels. That takes longer than the master keeps a silent connection.
             self._centralised.refresh(views, 0)
             rush.connect()
             await self._round(Parts(views.name, in_mm(size_m)), 0, reader, rush)
@@ -126,26 +126,26 @@ class Bench:
         return parts
 
     async def _connect_anew(self, reader: MapReader, rush: Rush) -> None:
-        """After a time in which the master has hung up on all who said nothing."""
+        """Reconnect after a pause in which the master closed all silent connections."""
         reader.close()
         reader.read()
         rush.connect()
         for member in self._members:
-            await member.tell(None, monotonic_ns())
+            await member.report(None, monotonic_ns())
 
     async def _round(self, parts: Parts, n: int, reader: MapReader, rush: Rush) -> NDArray[np.uint32]:
-        """Measure all parts once, at moment `n`; returns the map of all cameras."""
+        """Measure all parts once, at moment `n`. Return the map of all cameras."""
         views = self._views
         sights, unit_ms, trip_ms = [], [], []
         for camera, (work, member) in enumerate(zip(self._work, self._members, strict=True)):
             began_ns = stage_ns()
-            sight = work.look(views.depth[camera, n], views.joints[n])
-            looked_ns = stage_ns()
-            await member.tell(sight, monotonic_ns())
-            told_ns = stage_ns()
+            sight = work.filter_frame(views.depth[camera, n], views.joints[n])
+            filtered_ns = stage_ns()
+            await member.report(sight, monotonic_ns())
+            reported_ns = stage_ns()
             sights.append(sight)
-            unit_ms.append((looked_ns - began_ns) / NS_PER_MS)
-            trip_ms.append((told_ns - looked_ns) / NS_PER_MS)
+            unit_ms.append((filtered_ns - began_ns) / NS_PER_MS)
+            trip_ms.append((reported_ns - filtered_ns) / NS_PER_MS)
         rush.run([None] * CAMERAS)
         rush_ms, merge_ms, map_ms, merged = [], [], [], self._merged
         for count in range(1, CAMERAS + 1):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is compared: one unit at its frame, all cameras in one process, and all cameras into one octree.
+"""The contenders: one unit at its frame, all cameras in one process, and all cameras into one octree.
 
-All of it on one thread, on the same frames.
+All of them use one thread and the same frames.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from shared.wire import keys_to_bytes
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What a unit has to say of a frame: its voxels' keys (N,) uint32, and the parts of its update."""
+    """A unit's report of a frame: the keys (N,) uint32 of its voxels, and the parts of its update."""
 
     voxels: NDArray[np.uint32]
     keys: bytes
@@ -33,17 +33,17 @@ class Sight:
 
 
 class UnitWork:
-    """All that a unit does between a frame and its update."""
+    """All work of a unit between a frame and its update."""
 
     def __init__(self, pipeline: DepthPipeline) -> None:
         self.pipeline = pipeline
 
     def resize(self, voxel_size_m: float) -> None:
-        """Go on with voxels of another size."""
+        """Change the voxel size."""
         self.pipeline.apply(FilterSettings(voxel_size_m=voxel_size_m))
 
-    def look(self, depth: NDArray[np.uint16], joints: NDArray[np.float64]) -> Sight:
-        """Filter a frame, and tell what was seen and how well it fits; the seen report is made anew each time."""
+    def filter_frame(self, depth: NDArray[np.uint16], joints: NDArray[np.float64]) -> Sight:
+        """Filter a frame and report seen and health. The seen report is made anew each time."""
         result = self.pipeline.process(depth, joints)
         voxels, health = result.voxels, result.health
         told = Health(
@@ -63,10 +63,10 @@ class Centralised:
         self._work = work
         self._map = MergedMap(work[0].pipeline.lattice)
         self.merged: NDArray[np.uint32] = np.empty(0, np.uint32)
-        """The keys that the last refresh found."""
+        """Keys that the last refresh found."""
 
     def refresh(self, views: Views, n: int) -> list[float]:
-        """Milliseconds until the map holds the first camera, the first two, and so on, at moment `n`."""
+        """Return the milliseconds until the map holds the first camera, the first two, and so on, at moment `n`."""
         lattice = self._work[0].pipeline.lattice
         if self._map.lattice != lattice:
             self._map = MergedMap(lattice)
@@ -76,7 +76,7 @@ class Centralised:
         for camera, work in enumerate(self._work):
             began_ns = stage_ns()
             pipeline = work.pipeline
-            # A central computer must know no less of what is seen, and how well it fits.
+            # A central computer must compute seen and health, too.
             voxels = pipeline.process(views.depth[camera, n], views.joints[n]).voxels
             self._map.replace(camera, voxels.keys)
             filtered_ns = stage_ns()
@@ -88,15 +88,15 @@ class Centralised:
 
 
 class IntoOctree:
-    """As MoveIt's updaters do it: what is robot or CAD is taken from the cloud, the rest goes into one OctoMap.
+    """The way of MoveIt's updaters: robot and CAD are removed from the cloud, and the rest goes into one OctoMap.
 
-    In its favour: the CAD's expected depth is known beforehand and each link is drawn by Embree within its own
-    rectangle; rays that clear the free space are cast to what is left only, not to the robot and the CAD (MoveIt casts
-    these, too), and once for each voxel that is hit, not for each pixel; and no lock is shared with a planner.
+    In its favour: the CAD's expected depth is known beforehand, and Embree draws each link within its own rectangle.
+    Rays that clear the free space go only to the remaining points, not to the robot and the CAD (MoveIt casts these,
+    too), and once per hit voxel, not once per pixel. No lock is shared with a planner.
     """
 
     def __init__(self, views: Views, work: Sequence[UnitWork]) -> None:
-        """Needs the peers of `make bench-paper`."""
+        """Make the octree. It needs the peers of `make bench-paper`."""
         import octomap
 
         from benchmarks.peers import contenders
@@ -114,11 +114,11 @@ class IntoOctree:
         self.resize(settings.voxel_size_m)
 
     def resize(self, voxel_size_m: float) -> None:
-        """Begin a new octree, of voxels of this size."""
+        """Start a new octree with voxels of this size."""
         self._tree = self._new_tree(voxel_size_m)
 
     def refresh(self, n: int) -> list[float]:
-        """Milliseconds until the octree holds the first camera, the first two, and so on, at moment `n`."""
+        """Return the milliseconds until the octree holds the first camera, the first two, and so on, at moment `n`."""
         began_ns, until_ms = stage_ns(), []
         for camera in range(CAMERAS):
             self.insert(camera, n)
@@ -126,14 +126,14 @@ class IntoOctree:
         return until_ms
 
     def insert(self, camera: int, n: int) -> None:
-        """One frame: self filter, points, occupied voxels and free rays."""
+        """Insert one frame: self filter, points, occupied voxels and free rays."""
         eye, depth = self._cameras[camera], self._views.depth[camera, n]
         points_m = eye.points_m(depth, self.foreground(camera, n))
         origin_m = np.ascontiguousarray(eye.T_world_camera[:3, 3])
         self._tree.insertPointCloud(points_m, origin_m, discretize=True)
 
     def foreground(self, camera: int, n: int) -> NDArray[np.bool_]:
-        """Pixels (H, W) that are neither CAD nor robot: before the CAD's margin, and off the padded robot."""
+        """Return the pixels (H, W) that are neither CAD nor robot: before the CAD's margin, off the padded robot."""
         z_m = self._views.depth[camera, n] * np.float32(self._views.intrinsics.depth_scale_m)
         robot_m = self._robots[camera].robot_depth_link_by_link(self._views.joints[n]) - self._padding_m
         expected_m = np.minimum(self._static_m[camera], robot_m)
@@ -142,5 +142,5 @@ class IntoOctree:
 
 
 def prepared(views: Views, voxel_size_m: float) -> list[UnitWork]:
-    """The work of each camera's unit."""
+    """Return the work of each camera's unit."""
     return [UnitWork(views.pipeline(camera, voxel_size_m)) for camera in range(CAMERAS)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real master, and what it takes to bring voxels to it: by the units' own client, and by all units at once."""
+"""A real master, and the ways to bring voxels to it: by the units' own client, and by all units at once."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from simulation.fleet.processes import Processes
 from simulation.fleet.running_master import RunningMaster, start_master
 
 STALE_AFTER_S = 60.0
-"""Of the master in these measurements: a unit that waits for its turn is not stale meanwhile."""
+"""Stale time of the master in these measurements: a unit that waits for its turn must not go stale."""
 
 TIMEOUT_S = 5.0
 RECEIVE_BYTES = 65536
@@ -53,11 +53,11 @@ class Member:
 
     @classmethod
     def at(cls, url: str, token: str, number: int) -> Member:
-        """Unit `number`, connecting from an address of its own."""
+        """Return unit `number`, which connects from an address of its own."""
         return cls(number, f"paper-{number}", MasterClient(url, lambda: token, address_of(number)))
 
     async def register(self, intrinsics: Intrinsics, T_world_camera: Transform) -> None:
-        """Ask for the slot and tell where the camera is: from now on the unit works with the master's newest."""
+        """Register the unit and the pose of its camera, and take over the master's current versions."""
         request = InitializeRequest(
             contract=CONTRACT_VERSION,
             contract_minor=CONTRACT_MINOR,
@@ -71,7 +71,7 @@ class Member:
         self.versions = answer.versions.model_copy(update={"pose": pose})
 
     def update(self, sight: Sight | None, captured_at_ns: int) -> UpdateRequest:
-        """What it reports next; None: that it sees nothing unknown."""
+        """Return the unit's next update. None: it sees nothing unknown."""
         self.sequence += 1
         return UpdateRequest(
             id=self.id,
@@ -84,8 +84,8 @@ class Member:
             **({} if sight is None else {"keys": sight.keys, "seen": sight.seen, "health": sight.health}),
         )
 
-    async def tell(self, sight: Sight | None, captured_at_ns: int) -> None:
-        """Report by the unit's client, encoding included."""
+    async def report(self, sight: Sight | None, captured_at_ns: int) -> None:
+        """Post an update by the unit's client, encoding included."""
         update = self.update(sight, captured_at_ns)
         answer = await self.client.update(update)
         if answer.versions != self.versions:
@@ -94,7 +94,7 @@ class Member:
 
 
 class MapReader:
-    """Whoever asks for the merged map, as a robot does: over a connection that is kept open."""
+    """Reader of the merged map, as a robot reads it: over a connection that stays open."""
 
     def __init__(self, url: str, token: str) -> None:
         parts = urlsplit(url)
@@ -102,7 +102,7 @@ class MapReader:
         self._headers = {"Authorization": f"Bearer {token}", "Accept": MEDIA_TYPE}
 
     def read(self) -> bytes:
-        """The map as it is now, not yet unpacked."""
+        """Return the current map, not yet decoded."""
         self._http.request("GET", "/voxels?form=keys", headers=self._headers)
         answer = self._http.getresponse()
         body = answer.read()
@@ -111,17 +111,17 @@ class MapReader:
         return body
 
     def close(self) -> None:
-        """Hang up; the next question connects anew."""
+        """Close the connection. The next request reconnects."""
         self._http.close()
 
 
 def keys_of(body: bytes) -> NDArray[np.uint32]:
-    """The voxels' keys (N,) of a map."""
+    """Return the voxels' keys (N,) of a map."""
     return np.array(msgpack.unpackb(body)["voxels"], np.uint32)
 
 
 class Rush:
-    """Plain sockets by which several units report at the same moment, at next to no cost on their side."""
+    """Plain sockets by which several units report at the same moment, at almost no cost on their side."""
 
     def __init__(self, url: str, head: bytes, members: Sequence[Member]) -> None:
         parts = urlsplit(url)
@@ -130,7 +130,7 @@ class Rush:
         self._sockets: list[socket.socket] = []
 
     def connect(self) -> None:
-        """Begin new connections, since the master hangs up on who says nothing for some seconds."""
+        """Connect anew, because the master closes a connection that is silent for some seconds."""
         self.close()
         for member in self._members:
             each = socket.create_connection(self._server, TIMEOUT_S, (address_of(member.number), 0))
@@ -138,7 +138,7 @@ class Rush:
             each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def run(self, sights: Sequence[Sight | None]) -> float:
-        """All of them send at once; milliseconds until the last is answered."""
+        """Send all updates at once. Return the milliseconds until the last is answered."""
         chosen = list(zip(self._sockets, self._members, strict=True))[: len(sights)]
         requests = [
             with_head(self._head, encode_update(member.update(sight, monotonic_ns())))
@@ -155,36 +155,36 @@ class Rush:
         return spent_ms
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connections."""
         while self._sockets:
             self._sockets.pop().close()
 
 
 @dataclass(eq=False)
 class Site:
-    """A running master, and the head of an update's request to it."""
+    """A running master, and the HTTP head of an update to it."""
 
     master: RunningMaster
     head: bytes
 
     @property
     def url(self) -> str:
-        """Of the master."""
+        """Return the URL of the master."""
         return self.master.url
 
     @property
     def unit_token(self) -> str:
-        """Of the master's units."""
+        """Return the token of the master's units."""
         return self.master.unit_token
 
     def pin(self, cores: set[int]) -> None:
-        """Have the master run on these cores only, all of its threads."""
+        """Restrict the master, with all its threads, to these cores."""
         for thread in Path(f"/proc/{self.master.pid}/task").iterdir():
             with contextlib.suppress(ProcessLookupError):
                 os.sched_setaffinity(int(thread.name), cores)
 
     async def change_voxel_size(self, voxel_size_m: float) -> None:
-        """Have all units work with voxels of this size; they must register again."""
+        """Change the voxel size of all units. They must register again."""
         headers = self.master.as_operator
         changes: dict[str, Any] = {"voxel_size_m": voxel_size_m, "stale_after_s": STALE_AFTER_S}
         async with httpx.AsyncClient(base_url=self.url, headers=headers, trust_env=False) as client:
@@ -194,17 +194,17 @@ class Site:
 
 
 async def start(processes: Processes, folder: Path, cell: Path) -> Site:
-    """A master of this cell on a free port.
+    """Start a master of this cell on a free port.
 
     Raises:
-        MasterUnreachable: it ends instead, or does not come in time.
+        MasterUnreachable: the master ends, or does not start in time.
     """
     master = await start_master(processes, cell, folder / "state", "--log-level", "WARNING")
     return Site(master, await captured_head(master.url, master.unit_token))
 
 
 def _answer(connection: socket.socket) -> bytes:
-    """The body of an answer, once it is whole."""
+    """Return the body of an answer once it is complete."""
     received = b""
     while True:
         data = connection.recv(RECEIVE_BYTES)

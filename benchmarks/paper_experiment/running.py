@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Units and a master as processes on this one machine: from frames handed to all at once to a map that holds them."""
+"""Units and a master as processes on this one machine, from frames for all at once to a map that holds them."""
 
 from __future__ import annotations
 
@@ -17,44 +17,46 @@ from benchmarks.paper_experiment.book import ONE_PROCESS_BESIDE, UNITS_RUNNING, 
 from benchmarks.paper_experiment.contenders import Centralised, UnitWork, prepared
 from benchmarks.paper_experiment.master import MapReader, Site, keys_of
 from benchmarks.paper_experiment.scene import CAMERAS, Views
-from benchmarks.paper_experiment.unit import Look, Order, Resize, Watch, run
+from benchmarks.paper_experiment.unit import Command, FilterFrame, Resize, UseCamera, run
 from shared.clock import NS_PER_MS, stage_ns
 from shared.errors import UplinkError
 
 ANSWER_S = 240.0
-"""For a unit to do what it is told: on a busy machine it may have to compile first."""
+"""Time limit for a unit's command: on a busy machine it may have to compile first."""
 
 END_S = 5.0
-"""For a unit's process to end."""
+"""Time limit for a unit's process to end."""
 
 
 @dataclass(eq=False)
 class Units:
-    """Processes of units, and the pipes by which they are told what to do."""
+    """Processes of units, and the pipes that carry their commands."""
 
     pipes: list[Connection]
 
-    def tell_all(self, orders: Sequence[Order]) -> None:
-        """Give each of the first units its order, and wait until all are done.
+    def send_all(self, commands: Sequence[Command]) -> None:
+        """Send one command to each of the first units, and wait until all are done.
 
         Raises:
-            UplinkError: one ended instead, or does not come to an end with it.
+            UplinkError: a unit ended, or did not finish in time.
         """
-        chosen = self.pipes[: len(orders)]
-        for pipe, order in zip(chosen, orders, strict=True):
-            pipe.send(order)
+        chosen = self.pipes[: len(commands)]
+        for pipe, command in zip(chosen, commands, strict=True):
+            pipe.send(command)
         for number, pipe in enumerate(chosen):
             if not pipe.poll(ANSWER_S):
-                raise UplinkError(f"unit {number} did not do within {ANSWER_S:g} s what it was told")
+                raise UplinkError(
+                    f"unit {number} did not finish its command within {ANSWER_S:g} s; see its output above"
+                )
             try:
                 pipe.recv()
             except EOFError as error:
-                raise UplinkError(f"unit {number} ended; what it said stands above") from error
+                raise UplinkError(f"unit {number} ended; see its output above") from error
 
 
 @contextmanager
 def running(site: Site) -> Iterator[Units]:
-    """So many units as there are cameras; they end with this."""
+    """Start one unit per camera. They end with the context."""
     context = multiprocessing.get_context("spawn")
     ours, processes = [], []
     for number in range(CAMERAS):
@@ -71,7 +73,7 @@ def running(site: Site) -> Iterator[Units]:
             try:
                 here.send(None)
             except OSError:
-                # It ended by itself.
+                # The process ended by itself.
                 continue
         for process in processes:
             process.join(END_S)
@@ -81,26 +83,26 @@ def running(site: Site) -> Iterator[Units]:
 
 
 class Bench:
-    """One resolution, told to all units."""
+    """One resolution, with all units on it."""
 
     def __init__(self, site: Site, units: Units, views: Views, folder: Path, book: Book) -> None:
         self._site, self._units, self._views, self._book = site, units, views, book
         self._work = prepared(views, 0.05)
         self._centralised = Centralised(self._work)
-        orders: list[Order] = []
+        commands: list[Command] = []
         for camera, pose in enumerate(views.poses):
             path = folder / f"{views.name}-{camera}.npy"
             np.save(path, views.depth[camera])
-            orders.append(Watch(views.intrinsics, pose, path, views.joints))
-        units.tell_all(orders)
+            commands.append(UseCamera(views.intrinsics, pose, path, views.joints))
+        units.send_all(commands)
 
     async def run(self, sizes_m: Sequence[float], rounds: int) -> None:
-        """So many rounds for each voxel size, in turns with all cameras in one process."""
+        """Run `rounds` rounds for each voxel size, in turns with all cameras in one process."""
         for size_m in sizes_m:
             await self._site.change_voxel_size(size_m)
             for work in self._work:
                 work.resize(size_m)
-            self._units.tell_all([Resize(size_m)] * CAMERAS)
+            self._units.send_all([Resize(size_m)] * CAMERAS)
             expected = [
                 [_keys(work, self._views, i, n) for n in range(self._views.frames)] for i, work in enumerate(self._work)
             ]
@@ -114,10 +116,10 @@ class Bench:
                     self._book.add(ONE_PROCESS_BESIDE, self._views.name, size_m, centralised_ms)
 
     def _refresh(self, count: int, n: int, reader: MapReader, expected: list[list[NDArray[np.uint32]]]) -> float:
-        """Milliseconds until the map holds what the first `count` units see at moment `n`, and nothing else."""
-        self._units.tell_all([Look(None)] * CAMERAS)
+        """Return the milliseconds until the map holds exactly what the first `count` units see at moment `n`."""
+        self._units.send_all([FilterFrame(None)] * CAMERAS)
         began_ns = stage_ns()
-        self._units.tell_all([Look(n)] * count)
+        self._units.send_all([FilterFrame(n)] * count)
         body = reader.read()
         spent_ms = (stage_ns() - began_ns) / NS_PER_MS
         right = np.unique(np.concatenate([keys[n] for keys in expected[:count]]))
@@ -127,4 +129,4 @@ class Bench:
 
 
 def _keys(work: UnitWork, views: Views, camera: int, n: int) -> NDArray[np.uint32]:
-    return work.look(views.depth[camera, n], views.joints[n]).voxels
+    return work.filter_frame(views.depth[camera, n], views.joints[n]).voxels

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's cell: a UR3 that moves, a person beside it, four cameras about them.
+"""The paper's cell: a UR3 that moves, a person beside it, four cameras around them.
 
-Rendered once, beforehand; every contender gets the same frames. All pixels are rays cast by Embree, with the faults of
-the camera on them.
+The frames are rendered once, beforehand, and every contender gets the same ones. Embree casts a ray for each pixel, and
+the faults of the camera are added.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from simulation.world.world import World
 
 CAMERAS = 4
 CORNERS_M = ((1.4, 1.4, 1.3), (-1.4, -1.4, 1.3), (1.4, -1.4, 1.3), (-1.4, 1.4, 1.3))
-"""Where the cameras hang: in the room's corners, opposite ones first."""
+"""Positions of the cameras in the room's corners, opposite ones first."""
 
 LOOKED_AT_M = (0.3, 0.0, 0.1)
 
@@ -37,7 +37,7 @@ PERSON = Person(Loop((0.95, 0.0), 0.5 * math.pi, 0.5, 0.18), floor_m=-0.825, dwe
 """Walks up and down before the table."""
 
 FRAME_S = 0.37
-"""Between frames; no part of a step's or the robot's period."""
+"""Time between frames. It divides neither the period of a step nor that of the robot."""
 
 ROBOT_PERIOD_S = 5.0
 
@@ -60,35 +60,35 @@ class Views:
 
     @property
     def name(self) -> str:
-        """The resolution in words."""
+        """Return the resolution in words."""
         return f"{self.intrinsics.width}x{self.intrinsics.height}"
 
     @property
     def frames(self) -> int:
-        """How many moments there are."""
+        """Return the number of moments."""
         return len(self.joints)
 
     def pipeline(self, camera: int, voxel_size_m: float) -> DepthPipeline:
-        """The filter of one camera."""
+        """Return the filter of one camera."""
         pose, settings = self.poses[camera], FilterSettings(voxel_size_m=voxel_size_m)
         return DepthPipeline(self.intrinsics, pose, self.cell, settings)
 
     def of_one(self, camera: int) -> Views:
-        """The same, but all cameras hang where this one does and have its frames."""
-        # Copied, for kernels are compiled anew for what they may not write to.
+        """Return the same moments, but with all cameras at the place of this one and with its frames."""
+        # The arrays are copied, because kernels are compiled again for read-only arrays.
         depth = np.stack([self.depth[camera]] * CAMERAS)
         return replace(self, poses=(self.poses[camera],) * CAMERAS, depth=depth)
 
 
 def world() -> World:
-    """The cell with its moving robot and the person."""
+    """Return the cell with its moving robot and the person."""
     phases = np.linspace(0.0, 5.0, len(HOME_RAD))
     path = RobotPath(HOME_RAD, np.full((1, len(HOME_RAD)), SWING_RAD), phases[None], ROBOT_PERIOD_S)
     return World(room(), path, (PERSON,))
 
 
 def views(width: int, height: int, frames: int) -> Views:
-    """What all cameras see at so many moments.
+    """Render the frames of all cameras at `frames` moments.
 
     Raises:
         InputError: a D435i has no such resolution.
@@ -107,7 +107,7 @@ def views(width: int, height: int, frames: int) -> Views:
 
 
 def write_cell(cell: Cell, path: Path) -> None:
-    """Leave the cell as the file that a master starts with; its static bodies are boxes along the axes."""
+    """Write the cell as the file that a master starts with. Its static bodies are boxes along the axes."""
     static = []
     for body in cell.static:
         low, high = body.mesh.vertices.min(axis=0), body.mesh.vertices.max(axis=0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's tables from what was measured, and beside them what the paper states."""
+"""The paper's tables from the measurements, beside the figures that the paper states."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from benchmarks.reporting.report import Mark, Result
 PAPER = "Distributed Camera Subsystem for Obstacle Detection, Sensors 2022, 22(12), 4588"
 
 PAPER_CAMERAS = 3
-"""In its Tables 1 and 2."""
+"""Number of cameras in the paper's Tables 1 and 2."""
 
 PAPER_FPS = {"424x240": 15.0, "640x480": 6.0, "1280x720": 2.0}
-"""Frames a second that its centralised system reached with three cameras, of 15 asked for."""
+"""Frames per second that the paper's centralised system reached with three cameras, of 15 requested."""
 
 PAPER_SMALL_VOXELS_S = {"424x240": 1.9, "640x480": 2.0, "1280x720": 2.9}
-"""What its centralised system took for voxels smaller than 20 mm."""
+"""Refresh of the paper's centralised system for voxels smaller than 20 mm."""
 
 PAPER_DISTRIBUTED_S = (0.05, 0.3)
-"""From the quickest to the slowest refresh, over all resolutions and voxel sizes."""
+"""Fastest and slowest refresh, over all resolutions and voxel sizes."""
 
 PAPER_FASTER_PERCENT = (38.7, 40.1, 59.4, 71.5)
-"""By how much its distributed system was faster with one, two, three and four cameras (Equation 7)."""
+"""Gain of the paper's distributed system with one, two, three and four cameras (Equation 7)."""
 
 PAPER_TRANSFER_MS = 12.0
-"""Mean of an update of up to 1000 voxels, there and back, four units."""
+"""Mean time of an update of up to 1000 voxels, there and back, four units."""
 
 PAPER_FRAME_KBIT, PAPER_UPDATE_KBIT = 9800.0, 9.3
-"""A depth image of 640x480, and a unit's update, as it counts them."""
+"""Size of a depth image of 640x480 and of a unit's update, by the paper's count."""
 
 STATED = {
     "source": PAPER,
@@ -58,26 +58,27 @@ NOT_COMPARABLE = (
     "The paper's distributed units were Jetson Nanos (four Cortex-A57 at 1.43 GHz), its centralised system a laptop "
     "with a GTX 1070, with real cameras at 15 frames a second: its milliseconds and ours are not comparable, the "
     "ratios between contenders on one machine are.",
-    "The cells of its Tables 1 and 2 are not in its text; only what the text states stands beside ours.",
-    "Frames are simulated (rays by Embree, a D435i's faults), one person, a UR3 that moves in every frame; the joints "
-    "lie beside the frames, and nobody reports joints to the master meanwhile.",
+    "The text of the paper does not contain the cells of its Tables 1 and 2; only the figures in the"
+    " text are compared with ours.",
+    "Frames are simulated (rays by Embree, a D435i's faults), one person, a UR3 that moves in every "
+    "frame. The joints are stored with the frames, and no joints are sent to the master meanwhile.",
 )
 
 BELOW_ZERO = (
-    "Below zero the centralised way is the faster one: where a frame costs less than bringing its voxels to a master. "
-    "What is compared are equal cores; the paper's centralised computer was the stronger one."
+    "Below zero the centralised way is faster: a frame costs less than bringing its voxels to a "
+    "master. The comparison uses equal cores; the paper's centralised computer was the stronger one."
 )
 
 Row = tuple[str | float, ...]
 
 
 def faster_percent(distributed_ms: float, centralised_ms: float) -> float:
-    """Equation 7: by how much the distributed way is faster, in percent of the centralised one's time."""
+    """Equation 7: return the gain of the distributed way in percent of the centralised time."""
     return 100.0 * (centralised_ms - distributed_ms) / centralised_ms
 
 
 def by_size(book: Book, contender: str, cameras: int = PAPER_CAMERAS) -> Result:
-    """Refresh of the whole scene by voxel size and resolution, as in Tables 1 and 2."""
+    """Return the refresh of the whole scene by voxel size and resolution, as in Tables 1 and 2."""
     keys = [key for key in book if key.contender == contender and key.cameras == cameras]
     resolutions = list(dict.fromkeys(key.resolution for key in keys))
     rows: list[Row] = []
@@ -93,7 +94,7 @@ def by_size(book: Book, contender: str, cameras: int = PAPER_CAMERAS) -> Result:
 
 
 def by_cameras(book: Book, contenders: Sequence[str], voxel_mm: int) -> Result:
-    """Refresh by the number of cameras, as in Figure 12."""
+    """Return the refresh by the number of cameras, as in Figure 12."""
     rows: list[Row] = []
     for resolution in dict.fromkeys(key.resolution for key in book):
         for contender in contenders:
@@ -105,7 +106,7 @@ def by_cameras(book: Book, contenders: Sequence[str], voxel_mm: int) -> Result:
 
 
 def faster(book: Book, distributed: str, centralised: Sequence[str]) -> Result:
-    """Equation 7 by the number of cameras: mean over all resolutions and voxel sizes that both were measured at."""
+    """Return Equation 7 by the number of cameras: the mean over all resolutions and voxel sizes that both have."""
     rows: list[Row] = []
     for count in range(1, CAMERAS + 1):
         means = []
@@ -124,7 +125,7 @@ def faster(book: Book, distributed: str, centralised: Sequence[str]) -> Result:
 
 
 def faster_by_resolution(book: Book, cameras: int = PAPER_CAMERAS) -> Result:
-    """Equation 7 by resolution, as in Table 2: mean over the voxel sizes that both were measured at."""
+    """Return Equation 7 by resolution, as in Table 2: the mean over the voxel sizes that both have."""
     rows: list[Row] = []
     for resolution in dict.fromkeys(key.resolution for key in book):
         cells: list[str | float] = [resolution]
@@ -143,7 +144,7 @@ def faster_by_resolution(book: Book, cameras: int = PAPER_CAMERAS) -> Result:
 
 
 def anatomy(parts: Sequence[Parts]) -> Result:
-    """Of what a composed refresh of all cameras consists, and what travels for it."""
+    """Return the parts of a composed refresh of all cameras, and the bytes of its updates."""
     rows: list[Row] = []
     for each in parts:
         unit, trip = np.array(each.unit_ms), np.array(each.trip_ms)
@@ -177,7 +178,7 @@ def anatomy(parts: Sequence[Parts]) -> Result:
 
 
 def beside_the_paper(book: Book, parts: Sequence[Parts]) -> Result:
-    """What the paper states, and what was measured here under the same name."""
+    """Return the figures that the paper states beside those measured here under the same name."""
     rows: list[Row] = []
     resolutions = list(dict.fromkeys(key.resolution for key in book))
     smallest_mm = min(key.voxel_mm for key in book)
@@ -213,7 +214,7 @@ def beside_the_paper(book: Book, parts: Sequence[Parts]) -> Result:
 
 
 def running(book: Book) -> Result:
-    """Units as processes on this machine, beside all cameras in one process on it."""
+    """Return the refresh by unit processes on this machine beside that by all cameras in one process."""
     rows: list[Row] = []
     for key in book:
         if key.contender != UNITS_RUNNING:
@@ -223,25 +224,25 @@ def running(book: Book) -> Result:
         rows.append((key.resolution, key.voxel_mm, key.cameras, ours.median_ms, ours.p99_ms, theirs))
     columns = ("resolution", "voxel mm", "cameras", "processes ms", "p99", "one process ms")
     remark = (
-        "Here the units share this machine's cores and pay for processes and HTTP besides: what is gained by units is "
-        "that each brings a computer of its own."
+        "Here the units share this machine's cores and also pay for processes and HTTP. The gain of "
+        "units is that each brings a computer of its own."
     )
     return Result(f"Refresh of the scene: {UNITS_RUNNING}", columns, tuple(rows), remarks=(remark,))
 
 
 def over_cameras(book: Book, contender: str, resolution: str, voxel_mm: int) -> list[tuple[float, float]]:
-    """Refresh in milliseconds over the number of cameras."""
+    """Return the refresh in milliseconds over the number of cameras."""
     return [(count, book.median(contender, resolution, voxel_mm, count)) for count in range(1, CAMERAS + 1)]
 
 
 def over_sizes(book: Book, contender: str, resolution: str, cameras: int) -> list[tuple[float, float]]:
-    """Refresh in milliseconds over the voxel size in millimetres."""
+    """Return the refresh in milliseconds over the voxel size in millimetres."""
     sizes = sorted({key.voxel_mm for key in book if (key.contender, key.resolution) == (contender, resolution)})
     return [(size, book.median(contender, resolution, size, cameras)) for size in sizes]
 
 
 def marks(book: Book, same: Parts) -> tuple[Mark, ...]:
-    """What the distributed way is held against; `same` are the parts where all cameras have the same frames."""
+    """Return the marks of the distributed way. In `same` all cameras have the same frames."""
     refresh_ms = np.median(same.refresh_ms(), axis=0)
     one, four = float(refresh_ms[0]), float(refresh_ms[-1])
     small = max(
@@ -260,7 +261,7 @@ def marks(book: Book, same: Parts) -> tuple[Mark, ...]:
 
 
 def more_of_four(same: Parts) -> str:
-    """Where the time goes that four cameras with the same frames take longer than one."""
+    """Return a sentence on the additional time of four cameras with the same frames compared with one."""
     work_ms = np.array(same.unit_ms) + np.array(same.trip_ms)
     slowest_ms = float(np.median(work_ms.max(axis=1)) - np.median(work_ms[:, 0]))
     waited_ms = float(np.median(same.waited_ms()[:, -1]))
@@ -276,13 +277,13 @@ def more_of_four(same: Parts) -> str:
 
 
 def views_ratio(parts: Parts) -> tuple[float, float]:
-    """A refresh of four cameras with views of their own, in refreshes of the first alone, and of the slowest alone."""
+    """Return a refresh of four cameras with their own views, in refreshes of the first or the slowest alone."""
     together, alone = np.median(parts.refresh_ms()[:, -1]), np.median(parts.alone_ms(), axis=0)
     return float(together / alone[0]), float(together / alone.max())
 
 
 def _slowest_ms(book: Book, contender: str, resolution: str) -> float:
-    """Of all voxel sizes, three cameras; NaN where it was not measured."""
+    """Return the slowest of all voxel sizes with three cameras; NaN if nothing was measured."""
     found = [
         book.spread(key).median_ms
         for key in book

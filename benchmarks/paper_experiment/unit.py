@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One unit as a process: is told which frame it sees, filters it, and reports it by the units' own client."""
+"""One unit as a process: it gets the number of a frame, filters the frame, and reports it by the units' own client."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from simulation.fleet.processes import die_with_parent
 
 
 @dataclass(frozen=True, eq=False)
-class Watch:
-    """Go on with another camera: `frames` is an npy file of (N, H, W) uint16, `joints` (N, n) rad are theirs."""
+class UseCamera:
+    """Switch to another camera: `frames` is an npy file of (N, H, W) uint16, `joints` (N, n) rad belong to them."""
 
     intrinsics: Intrinsics
     T_world_camera: Transform
@@ -34,52 +34,52 @@ class Watch:
 
 @dataclass(frozen=True)
 class Resize:
-    """Go on with voxels of another size, and register anew."""
+    """Change the voxel size, and register again."""
 
     voxel_size_m: float
 
 
 @dataclass(frozen=True)
-class Look:
-    """Filter frame `number` and report it; None: report that nothing unknown is there."""
+class FilterFrame:
+    """Filter frame `number` and report it. None: report that nothing unknown is there."""
 
     number: int | None
 
 
-Order = Watch | Resize | Look | None
-"""What a unit is told to do; it says True when that is done. None: come to an end."""
+Command = UseCamera | Resize | FilterFrame | None
+"""Command to a unit, which answers True when it is done. None: end."""
 
 
-def run(orders: Connection, url: str, token: str, number: int) -> None:
-    """Do what is asked until told to end."""
+def run(commands: Connection, url: str, token: str, number: int) -> None:
+    """Execute commands until the one that ends the process."""
     die_with_parent()
-    asyncio.run(_Unit(orders, Member.at(url, token, number)).run())
+    asyncio.run(_Unit(commands, Member.at(url, token, number)).run())
 
 
 class _Unit:
-    def __init__(self, orders: Connection, member: Member) -> None:
-        self._orders, self._member = orders, member
+    def __init__(self, commands: Connection, member: Member) -> None:
+        self._commands, self._member = commands, member
         self._cell: Cell = room()
 
     async def run(self) -> None:
         async with self._member.client:
-            # Nothing else waits for this loop: it may stand still until there is something to do.
-            while (order := self._orders.recv()) is not None:
-                await self._obey(order)
-                self._orders.send(True)
+            # Nothing else runs in this loop, so it may block until a command comes.
+            while (command := self._commands.recv()) is not None:
+                await self._execute(command)
+                self._commands.send(True)
 
-    async def _obey(self, order: Watch | Resize | Look) -> None:
-        if isinstance(order, Watch):
-            self._watch, self._depth = order, np.load(order.frames)
-            self._work = UnitWork(DepthPipeline(order.intrinsics, order.T_world_camera, self._cell))
-        elif isinstance(order, Resize):
-            self._work.resize(order.voxel_size_m)
-            await self._member.register(self._watch.intrinsics, self._watch.T_world_camera)
-            # Compiles what is not yet, and leaves the connection open.
-            self._work.look(self._depth[0], self._watch.joints[0])
-            await self._member.tell(None, monotonic_ns())
-        elif order.number is None:
-            await self._member.tell(None, monotonic_ns())
+    async def _execute(self, command: UseCamera | Resize | FilterFrame) -> None:
+        if isinstance(command, UseCamera):
+            self._camera, self._depth = command, np.load(command.frames)
+            self._work = UnitWork(DepthPipeline(command.intrinsics, command.T_world_camera, self._cell))
+        elif isinstance(command, Resize):
+            self._work.resize(command.voxel_size_m)
+            await self._member.register(self._camera.intrinsics, self._camera.T_world_camera)
+            # Compiles the missing kernels, and leaves the connection open.
+            self._work.filter_frame(self._depth[0], self._camera.joints[0])
+            await self._member.report(None, monotonic_ns())
+        elif command.number is None:
+            await self._member.report(None, monotonic_ns())
         else:
-            captured_at_ns, n = monotonic_ns(), order.number
-            await self._member.tell(self._work.look(self._depth[n], self._watch.joints[n]), captured_at_ns)
+            captured_at_ns, n = monotonic_ns(), command.number
+            await self._member.report(self._work.filter_frame(self._depth[n], self._camera.joints[n]), captured_at_ns)

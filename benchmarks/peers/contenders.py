@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same work by Open3D, OctoMap, DUFOMap and Embree, each as its documentation has one do it, on one thread.
+"""The same work by Open3D, OctoMap, DUFOMap and Embree, each used as its documentation says, on one thread.
 
-What does not change from frame to frame they are given for nothing: rays, the CAD's expected depth, the margins.
+Constants between frames cost the peers nothing: rays, the CAD's expected depth, the margins.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from shared.settings import FilterSettings
 from shared.transforms import Transform, apply, inverse
 
 o3d: Any = open3d
-"""Its stubs know fewer arrays than it takes."""
+"""Typed as Any, because the stubs of Open3D accept fewer array types than Open3D does."""
 
 PEERS = {
     "Open3D": "no margin that grows beside edges, no robot of two sides, no density filter, nothing of what is seen.",
@@ -32,14 +32,14 @@ PEERS = {
     "but keeps no probabilities.",
     "Embree": "only the expected depth, by exact rays.",
 }
-"""What each does more or less than the filter that it stands beside."""
+"""Differences of each contender's work from that of the filter beside it."""
 
 FAR_M = 60.0
-"""Beyond what uint16 of millimetres can be shortened by Open3D, and 60 m on its own account."""
+"""Depth limit in metres: more than Open3D can shorten uint16 millimetres to."""
 
 
 class Camera:
-    """Rays of a camera, and what they should see of the CAD."""
+    """Rays of a camera, and the depths that they should see of the CAD."""
 
     def __init__(self, intrinsics: Intrinsics, T_world_camera: Transform, cell: Cell) -> None:
         assert cell.robot is not None
@@ -57,7 +57,7 @@ class Camera:
         ]
 
     def links(self, joints: NDArray[np.float64]) -> list[tuple[NDArray[np.float32], NDArray[np.int32]]]:
-        """Vertices in the camera frame, and faces, of the robot's links."""
+        """Return vertices in the camera frame and faces of the robot's links."""
         T_camera_link = (self.T_camera_world @ self.robot.T_world_base @ self.robot.link_poses(joints)).astype(
             np.float32
         )
@@ -67,7 +67,7 @@ class Camera:
         ]
 
     def points_m(self, depth: NDArray[np.uint16], marked: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """World coordinates (N, 3) of the marked pixels."""
+        """Return the world coordinates (N, 3) of the marked pixels."""
         z_m = depth[marked] * self.intrinsics.depth_scale_m
         return apply(self.T_world_camera, self.directions[marked] * z_m[:, None])
 
@@ -89,18 +89,20 @@ class Open3D:
         self._noise_per_m = np.float32(settings.margin_noise_gain * noise_per_m)
 
     def expected_depth(self, joints: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Depth (H, W) in metres of the nearest known surface; the CAD's was cast before, the robot's is now."""
+        """Return the depth (H, W) in metres of the nearest known surface. The CAD's part is cached; the robot's is cast
+        now.
+        """
         return np.minimum(self._cast(self._camera.links(joints)), self._static_m)
 
     def foreground(self, depth: NDArray[np.uint16], expected_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """What is nearer than expected by more than a margin (H, W)."""
+        """Return the pixels (H, W) that are nearer than expected by more than a margin."""
         z_m = depth * np.float32(self._camera.intrinsics.depth_scale_m)
-        # z less its noise, where that is symmetric: as the filter reckons it.
+        # Depth less its noise, where the noise is symmetric, as in the filter.
         limit_m = expected_m / (np.float32(1.0) + self._noise_per_m * expected_m) - self._base_m
         return np.asarray((z_m > 0.0) & (z_m < limit_m))
 
     def voxels(self, depth: NDArray[np.uint16], marked: NDArray[np.bool_], voxel_size_m: float) -> int:
-        """How many voxels the marked pixels fall into."""
+        """Return the number of voxels that the marked pixels occupy."""
         image = o3d.geometry.Image(np.where(marked, depth, np.uint16(0)))
         cloud = o3d.geometry.PointCloud.create_from_depth_image(
             image, self._pinhole, self._camera.T_camera_world, 1.0 / self._camera.intrinsics.depth_scale_m, FAR_M
@@ -108,7 +110,7 @@ class Open3D:
         return len(cloud.voxel_down_sample(voxel_size_m).points)
 
     def process(self, depth: NDArray[np.uint16], joints: NDArray[np.float64], voxel_size_m: float) -> int:
-        """All of it."""
+        """Run all steps."""
         return self.voxels(depth, self.foreground(depth, self.expected_depth(joints)), voxel_size_m)
 
     def _cast(self, bodies: list[tuple[NDArray[np.float32], NDArray[np.int32]]]) -> NDArray[np.float32]:
@@ -119,38 +121,38 @@ class Open3D:
 
 
 class OctoMap:
-    """OctoMap: insertPointCloud into a tree that is kept from frame to frame."""
+    """OctoMap: insertPointCloud into a tree that persists from frame to frame."""
 
     def __init__(self, camera: Camera, voxel_size_m: float) -> None:
         self._origin_m = np.ascontiguousarray(camera.T_world_camera[:3, 3])
         self._tree = octomap.OcTree(voxel_size_m)
 
     def insert(self, points_m: NDArray[np.float64], once: bool = False) -> None:
-        """Points (N, 3) in the world, and the free space before them; `once`: one ray for all points of a voxel."""
+        """Insert points (N, 3) in the world, and the free space before them. `once`: one ray per voxel."""
         self._tree.insertPointCloud(points_m, self._origin_m, discretize=once)
 
 
 class DUFOMap:
-    """DUFOMap, on the octree of UFOMap, which is kept from frame to frame; on one thread, nothing inflated."""
+    """DUFOMap on the octree of UFOMap, which persists from frame to frame. One thread, nothing inflated."""
 
     def __init__(self, camera: Camera, voxel_size_m: float) -> None:
-        """Raises ImportError where there is no package of it."""
+        """Make an empty map. Raises ImportError if the package is not installed."""
         from dufomap import dufomap
 
         self._pose = np.ascontiguousarray(camera.T_world_camera)
         self._map = dufomap(voxel_size_m, 0.0, 0, num_threads=1)
 
     def insert(self, points_m: NDArray[np.float64]) -> None:
-        """Points (N, 3) in the world, and the free space before them."""
+        """Insert points (N, 3) in the world, and the free space before them."""
         self._map.run(points_m, self._pose, False)
 
     def in_free_space(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which of these points (N, 3) lie where a frame has looked through."""
+        """Return a mask of those points (N, 3) that lie in free space that a frame has observed."""
         return np.asarray(self._map.segment(points_m, self._pose, False), np.bool_)
 
 
 class Embree:
-    """Embree by way of embreex: a ray through each pixel centre."""
+    """Embree through embreex: one ray through each pixel centre."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
@@ -159,15 +161,17 @@ class Embree:
         self._links = [EmbreeLink(camera, link.mesh) for link in camera.robot.links]
 
     def expected_depth(self, joints: NDArray[np.float64]) -> NDArray[np.float32]:
-        """The whole picture (H, W) in metres, CAD and robot; joints are new, so the scene is, too."""
+        """Return the whole expected depth (H, W) in metres, CAD and robot. The scene is rebuilt for the joints."""
         return self._cast(self.scene(joints, with_cad=True))
 
     def robot_depth(self, joints: NDArray[np.float64]) -> NDArray[np.float32]:
-        """The robot alone, as if the CAD's picture were kept."""
+        """Return the depth of the robot alone, as if the CAD's depth were cached."""
         return self._cast(self.scene(joints, with_cad=False))
 
     def robot_depth_link_by_link(self, joints: NDArray[np.float64]) -> NDArray[np.float32]:
-        """The robot alone at its cheapest: a scene a link, made once, and no ray beside a link's rectangle."""
+        """Return the depth of the robot alone at the lowest cost: one cached scene per link, and no rays outside a
+        link's rectangle.
+        """
         camera = self._camera
         depth_m = np.full(camera.intrinsics.shape, np.inf, np.float32)
         T_camera_link = camera.T_camera_world @ camera.robot.T_world_base @ camera.robot.link_poses(joints)
@@ -176,7 +180,7 @@ class Embree:
         return depth_m
 
     def scene(self, joints: NDArray[np.float64], with_cad: bool) -> EmbreeScene:
-        """Everything in the camera frame."""
+        """Return a scene of everything in the camera frame."""
         scene = EmbreeScene()
         for vertices, faces in self._camera.links(joints) + (self._camera.static if with_cad else []):
             EmbreeMesh(scene, vertices, faces)
@@ -188,7 +192,7 @@ class Embree:
 
 
 class EmbreeLink:
-    """One link in its own frame, into which rays are brought."""
+    """One link in its own frame. Rays are transformed into that frame."""
 
     def __init__(self, camera: Camera, mesh: TriangleMesh) -> None:
         self._camera = camera
@@ -198,7 +202,7 @@ class EmbreeLink:
         self._corners_m = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)], np.float64)
 
     def lower(self, T_camera_link: Transform, depth_m: NDArray[np.float32]) -> None:
-        """Lower `depth_m` (H, W) to the link; it must lie before the camera."""
+        """Lower `depth_m` (H, W) to the link, which must lie before the camera."""
         uv = self._camera.intrinsics.project(apply(T_camera_link, self._corners_m))
         first = np.maximum(np.floor(uv.min(axis=0)), 0).astype(int)
         last = np.ceil(uv.max(axis=0)).astype(int)

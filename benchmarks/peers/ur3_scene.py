@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the speed is measured on: a UR3 in a room of known walls, something unknown beside it, a D435i before them.
+"""Scene of the speed test: a UR3 in a room of known walls, something unknown beside it, a D435i before them.
 
-Every pixel is a ray cast by Embree, with the faults of the camera on it, so that neither the filter nor a peer
-measures what it has drawn itself.
+Embree casts a ray for each pixel, and the faults of the camera are added. So neither the filter nor a peer measures
+what it has drawn itself.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from simulation.cameras.raycast import RaycastRenderer
 from simulation.world.scene import Body, Capsules, Owner, Scene
 
 UR3 = Path("cmeel.prefix/share/example-robot-data/robots/ur_description/urdf/ur3_robot.urdf")
-"""Where the wheel of example-robot-data has it; its collision meshes have 37,476 triangles."""
+"""Path in the wheel of example-robot-data. The collision meshes have 37,476 triangles."""
 
 T_WORLD_CAMERA = look_at((1.0, 0.45, 0.85), (0.05, -0.05, 0.2))
 
 LOW_M, HIGH_M = np.array((-1.6, -1.6, -0.9)), np.array((1.6, 1.6, 1.5))
-"""All that the camera can see lies within."""
+"""Box that contains everything that the camera can see."""
 
 WALL_M = 1.5
-"""How far the walls stand from the robot."""
+"""Distance of the walls from the robot."""
 
 HOME_RAD = np.array((0.3, -1.2, 1.3, -1.5, -1.5, 0.0))
 SWING_RAD = 0.6
 
 FOREGROUND_SHARE = 0.1
 STRANGER_AXES_M = np.array((0.2, 0.25, 0.5))
-"""Half axes of the ellipsoid that stands for a person, before it is scaled to `FOREGROUND_SHARE` of the picture."""
+"""Half axes of the ellipsoid that represents a person, before it is scaled to `FOREGROUND_SHARE` of the image."""
 
 T_WORLD_STRANGER = from_xyz_rpy((0.05, -0.85, 0.1), (0.0, 0.0, 0.4))
 
@@ -58,8 +58,7 @@ class Recording:
     Attributes:
         depth: (N, H, W) uint16.
         joints: (N, 6) rad, each frame's.
-        unhindered: (N, H, W) uint16, the same without a pixel that was not measured: for a cell in which nothing is
-            known they are all foreground.
+        unhindered: (N, H, W) uint16, the same with every pixel measured: all foreground in an empty cell.
     """
 
     intrinsics: Intrinsics
@@ -70,33 +69,33 @@ class Recording:
 
     @property
     def T_world_camera(self) -> Transform:
-        """The camera's pose."""
+        """Return the camera's pose."""
         return T_WORLD_CAMERA
 
     def pipeline(self, voxel_size_m: float) -> DepthPipeline:
-        """The filter of this camera."""
+        """Return the filter of this camera."""
         return DepthPipeline(self.intrinsics, T_WORLD_CAMERA, self.cell, FilterSettings(voxel_size_m=voxel_size_m))
 
     def pipeline_that_knows_nothing(self, voxel_size_m: float) -> DepthPipeline:
-        """The filter of this camera in an empty cell: whatever is measured is foreground."""
+        """Return the filter of this camera in an empty cell, in which every measured pixel is foreground."""
         empty = Cell("nothing is known", LOW_M, HIGH_M)
         return DepthPipeline(self.intrinsics, T_WORLD_CAMERA, empty, FilterSettings(voxel_size_m=voxel_size_m))
 
 
 def ur3() -> Robot:
-    """The UR3 of example-robot-data.
+    """Return the UR3 of example-robot-data.
 
     Raises:
         CellwatchError: the package is not installed.
     """
     path = Path(sysconfig.get_path("purelib")) / UR3
     if not path.is_file():
-        raise CellwatchError(f"{path}: no such file; the benchmarks need example-robot-data")
+        raise CellwatchError(f"{path}: no such file; install example-robot-data, which the benchmarks need")
     return Robot.from_urdf(path)
 
 
 def room() -> Cell:
-    """Floor, table, three walls and the UR3."""
+    """Return the cell: floor, table, three walls and the UR3."""
     thick_m = 0.05
     span_m = 2.0 * (WALL_M + thick_m)
     size = {
@@ -118,7 +117,7 @@ def room() -> Cell:
 
 
 def record(width: int, height: int, frames: int, seed: int = 0) -> Recording:
-    """`frames` frames, no two with the same joints; `FOREGROUND_SHARE` of the first one's pixels are foreground."""
+    """Render `frames` frames with different joints. `FOREGROUND_SHARE` of the first one's pixels are foreground."""
     intrinsics, cell = d435i_intrinsics(width, height), room()
     renderer = RaycastRenderer(intrinsics, T_WORLD_CAMERA)
     sensor = DepthSensor(intrinsics, DepthNoise(), seed)

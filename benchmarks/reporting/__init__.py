@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures for people and machines, and all of them as one page.
+"""Tables and marks, JSON results, and all results as one page.
 
 In the order of the flow:
 
-    circumstances  when, on what machine and of which state of the source a figure was taken
+    circumstances  time, machine and commit of a measurement
     report         tables and curves for people, marks, and one line of JSON for machines
-    parts          each part of the report: its command, the question that it answers, how long it may take
-    plots          curves as pictures
+    parts          each part of the report: its command, the question that it answers, its time limit
+    plots          curves as plots
     page           all results as one page
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When, on what machine and of which state of the source a figure was taken."""
+"""Time, machine and commit of a measurement."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from shared.clock import NS_PER_S, wall_ns
 PACKAGES = ("numpy", "numba", "trimesh", "fastapi", "uvicorn", "httpx", "open3d", "octomap-python", "embreex")
 
 LOAD_BEFORE = os.getloadavg()[0]
-"""Processes that wanted to run in the minute before this one began: what others did to the figures."""
+"""Load of the machine in the minute before this process began, by other processes."""
 
 MEASURED = (":!benchmarks/baseline", ":!benchmarks/plots", ":!benchmarks/REPORT.md")
-"""What `make bench` keeps: it makes no other source of it."""
+"""Files that `make bench` itself rewrites. They do not count as a change of the source."""
 
 GIT_S = 5.0
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def circumstances() -> dict[str, Any]:
-    """Of this run, as plain values; `packages` are those that are installed."""
+    """Return the circumstances of this run as plain values. `packages` are the installed ones."""
     return {
         "at": datetime.fromtimestamp(wall_ns() / NS_PER_S, timezone.utc).isoformat(timespec="seconds"),
         "source": revision(),

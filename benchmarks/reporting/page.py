@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All results as one page with tables and plots, `REPORT.md`: what was measured, when, on what and how."""
+"""All results as one page with tables and plots, `REPORT.md`: figures, time, machine and method."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from benchmarks.reporting.plots import draw
 FOLDER = Path(__file__).resolve().parents[1]
 REPORT = FOLDER / "REPORT.md"
 BASELINE = FOLDER / "baseline"
-"""The results that `REPORT.md` shows, kept with the source."""
+"""Results that `REPORT.md` shows, kept with the source."""
 
 ROWS_OPEN_MAX = 24
-"""A longer table is folded away: who wants all of it opens it."""
+"""A longer table is folded; the reader can open it."""
 
 MARKS_OPEN_MAX = 8
-"""A part with more is one row of the overview, beside those that were missed; its section has them all."""
+"""A part with more marks is one row of the overview, plus its missed marks. Its section lists all of them."""
 
 MARKS_HEAD = ["| | measured | mark | |", "| --- | ---: | ---: | --- |"]
 
 INTRODUCTION = """\
 # What was measured
 
-Each figure was taken by the command that is named beside it, of the source whose commit is named, too. `make bench`
-measures anew what fits into some 20 minutes on two cores with nothing else to do, the other commands run by themselves;
-`make bench ARGS="--page-only --keep"` keeps what they left last as the baseline that this page shows. Times on shared
-machines are noisy: contenders take turns within one run, medians count, and what is claimed is a ratio within one run
-wherever it can be. Nothing here was measured on a Jetson or before a live camera.
+The section of each figure names the command that measured it, and the commit of the source. `make bench` measures
+the parts that fit into some 20 minutes on two idle cores; the other commands run by themselves.
+`make bench ARGS="--page-only --keep"` makes their last results the baseline that this page shows. Times on shared
+machines are noisy: contenders take turns within one run, medians count, and claims are ratios within one run where
+possible. Nothing here was measured on a Jetson or with a live camera.
 """
 
 
 def write_page(results: Sequence[Path], report: Path = REPORT) -> list[dict[str, Any]]:
-    """Write `report`, plots beside it in `plots/`; returns all marks found.
+    """Write `report`, with its plots in `plots/` beside it. Return all marks.
 
-    Each part's result is taken from the first of the folders `results` that has one.
+    The result of each part comes from the first of the folders `results` that has one.
     """
     found = {part.name: document for part in PARTS if (document := _read(results, f"{part.name}.json")) is not None}
     marks = [mark | {"part": name} for name, document in found.items() for mark in marks_in(document)]
@@ -53,7 +53,7 @@ def write_page(results: Sequence[Path], report: Path = REPORT) -> list[dict[str,
 
 
 def marks_in(document: Any) -> Iterator[dict[str, Any]]:
-    """Every mark of a result, however deep it lies."""
+    """Iterate over every mark of a result, at any depth."""
     for node in _nodes(document):
         for mark in node.get("marks", ()):
             if isinstance(mark, dict) and "met" in mark:
@@ -77,8 +77,8 @@ def _missed(found: dict[str, dict[str, Any]]) -> list[str]:
     missed = [mark for part in PARTS for mark in marks_in(found.get(part.name, {})) if not mark["met"]]
     if not missed:
         return ["All marks were met.", ""]
-    reasons = [f"- {mark['name']}: {mark.get('why', 'the reason is not known')}" for mark in missed]
-    return ["Missed, and what is known of the reason:", "", *reasons, ""]
+    reasons = [f"- {mark['name']}: {mark.get('why', 'the reason is unknown')}" for mark in missed]
+    return ["Missed marks, and their known reasons:", "", *reasons, ""]
 
 
 def _mark_row(mark: dict[str, Any]) -> str:
@@ -87,7 +87,7 @@ def _mark_row(mark: dict[str, Any]) -> str:
 
 
 def _section(part: Part, document: dict[str, Any], folder: Path) -> list[str]:
-    lines = [f"## {part.title}", "", part.asks, "", *_taken(part, document.get("taken")), ""]
+    lines = [f"## {part.title}", "", part.question, "", *_taken(part, document.get("taken")), ""]
     for node in _nodes(document):
         if "title" in node and "rows" in node:
             lines += _table(node)
@@ -106,7 +106,7 @@ def _taken(part: Part, taken: dict[str, Any] | None) -> list[str]:
     return [
         f"Taken {taken['at']} of {taken['source']}, on {taken['cores']} cores of {taken['cpu']}, "
         f"{taken['memory_gib']:g} GiB, {taken['system']}, Python {taken['python']}, {packages}; "
-        f"load before it began: {taken['load_average_before']:g}. Again: {again}."
+        f"load before the run: {taken['load_average_before']:g}. Again: {again}."
     ]
 
 
@@ -136,7 +136,7 @@ def _row(cells: Iterable[str]) -> str:
 
 
 def _cell(value: Any) -> str:
-    """Four digits are what such a measurement is worth; counts stand in full."""
+    """Format four digits, which is the precision of such a measurement. Counts are written in full."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -151,7 +151,7 @@ def _anchor(title: str) -> str:
 
 
 def _nodes(document: Any) -> Iterator[dict[str, Any]]:
-    """Each object of a document, outer ones first, in their order."""
+    """Iterate over each object of a document in its order, outer ones first."""
     if isinstance(document, dict):
         yield document
         for value in document.values():

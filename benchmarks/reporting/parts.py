@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be measured: each part's command, how long it may take, and the question that it answers."""
+"""Parts of the report: each part's command, its time limit, and the question that it answers."""
 
 from __future__ import annotations
 
@@ -8,127 +8,148 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Part:
-    """One module that leaves `out/results/NAME.json`."""
+    """One program of `benchmarks` or `qualification` that writes `out/results/NAME.json`."""
 
-    name: str
-    """Of the module, too."""
+    module: str
+    """Dotted name of the program. It runs as a process, so this package imports nothing of `qualification`."""
 
     target: str
-    """Of `make`, by which it runs alone."""
+    """Target of `make` that runs the part alone."""
 
     title: str
-    asks: str
+    question: str
     limit_s: float | None = None
-    """A part of `make bench` is ended after it; None: it runs only by itself."""
+    """Time limit of the part in `make bench`. None: the part runs only by itself."""
 
     arguments: tuple[str, ...] = ()
-    """With which `make bench` runs it."""
-
-    package: str = "benchmarks"
+    """Arguments that `make bench` passes."""
 
     @property
-    def runs(self) -> str:
-        """The module, for `python -m`."""
-        return f"{self.package}.{self.name}"
+    def name(self) -> str:
+        """Return the name of the result: the last part of the module's."""
+        return self.module.rpartition(".")[2]
 
 
 PARTS = (
     Part(
-        "pipeline",
+        "benchmarks.pipeline",
         "bench-pipeline",
-        "What a frame costs",
-        "How long does one core need from depth and joints to voxels, and how long do others for the same?",
+        "Cost of a frame",
+        "How long does one core need from depth and joints to voxels, and how long do its peers need?",
         limit_s=300.0,
     ),
     Part(
-        "scale",
+        "benchmarks.scale",
         "bench-scale",
-        "How many units one master carries",
-        "What do more units cost, what is the age of the map that a robot reads, and where does it bend?",
+        "Number of units for one master",
+        "What does each further unit cost, how old is the map at a robot, and how many units are too many?",
         limit_s=400.0,
     ),
     Part(
-        "latency",
+        "benchmarks.latency",
         "bench-latency",
         "From a frame to a robot's map",
-        "Where do the milliseconds go from the capture of a frame to the map that a robot has?",
+        "How long does each stage take from the capture of a frame to the map at a robot?",
         limit_s=240.0,
     ),
     Part(
-        "paper",
+        "benchmarks.paper",
         "bench-paper",
         "The paper's experiment",
-        "How long until the map holds what one to four cameras see: with a unit at each, or in one computer?",
+        "How long does a refresh of the map by one to four cameras take: with a unit at each, or in one computer?",
         limit_s=480.0,
     ),
     Part(
-        "real",
+        "benchmarks.real",
         "real",
         "Real frames of a real robot",
-        "How much of the known robot leaks into the map, and how much of an unknown one is missed?",
+        "How much of the known robot leaks into the map, and how much of an unknown robot is missed?",
         limit_s=200.0,
     ),
     Part(
-        "accuracy",
+        "benchmarks.accuracy",
         "bench-accuracy",
         "Accuracy against ground truth",
-        "How much of what stands before a camera is found, how much that does not, and how far off is the nearest?",
+        "How many obstacle voxels are found, how many are false, and how large is the error of the distance?",
         limit_s=400.0,
     ),
-    Part("sweeps", "sweeps", "Thin, small and silent things", "How thin may a thing be, how still is a still cell?"),
-    Part("right_time", "right-time", "The robot where it was", "What do late, jittering or rare joints cost?"),
-    Part("board", "bench-board", "Pose by a printed board", "How exactly is a camera's pose found?"),
     Part(
-        "pose_monitor",
+        "benchmarks.sweeps",
+        "sweeps",
+        "Thin things, small things and empty cells",
+        "How thin may a thing be, and how many false voxels does an empty cell have?",
+    ),
+    Part(
+        "benchmarks.right_time",
+        "right-time",
+        "The robot at the time of the frame",
+        "How do late, jittering or rare joints affect the filter?",
+    ),
+    Part(
+        "benchmarks.board",
+        "bench-board",
+        "Pose by a printed board",
+        "How accurate is a camera pose from a calibration board?",
+    ),
+    Part(
+        "benchmarks.pose_monitor",
         "bench-pose-monitor",
         "Knocked and covered cameras",
-        "How soon is it told, and how often wrongly?",
+        "How soon is a knock reported, and how often is there a false alarm?",
     ),
-    Part("master", "bench-master", "The master at its limit", "How many updates a second, beside a bare web service?"),
     Part(
+        "benchmarks.master",
+        "bench-master",
+        "The master at its limit",
+        "How many updates a second does it take, compared with a bare web service?",
+    ),
+    Part(
+        "qualification.faults",
         "faults",
-        "faults",
-        "Things that fail",
-        "What does the map say meanwhile, and how soon is it right again?",
-        package="qualification",
+        "Failures of the system",
+        "Is the map right during a failure, and how soon is it complete again?",
     ),
     Part(
+        "qualification.soak",
         "soak",
-        "soak",
-        "All of them at once",
-        "For as long as is wished: is any answer wrong, does anything grow?",
-        package="qualification",
+        "All failures at once",
+        "Is any answer wrong during a long run, and does any resource grow?",
     ),
     Part(
-        "source_faults",
+        "qualification.source_faults",
         "source-faults",
         "Cameras that fail",
-        "How soon is it told, and when do frames flow again?",
-        package="qualification",
+        "How soon is the failure reported, and how soon do frames flow again?",
     ),
     Part(
-        "plug_and_play",
+        "qualification.plug_and_play",
         "plug-and-play",
         "Power on and forget",
-        "How long until units that know nothing are live?",
-        package="qualification",
+        "How long until factory-new units are live?",
     ),
     Part(
-        "boot", "rehearsal", "Machines that boot", "How long from power-on to the first voxel?", package="qualification"
+        "qualification.boot",
+        "rehearsal",
+        "Machines that boot",
+        "How long from power-on to the first voxel?",
     ),
     Part(
-        "image",
+        "qualification.image",
         "image-test",
         "One image, two arm64 boards",
-        "Do they boot, differ and report, and how soon?",
-        package="qualification",
+        "Do both boot, get identities of their own and report, and how soon?",
     ),
     Part(
-        "window",
+        "qualification.fresh_machine",
+        "fresh-machine",
+        "The README on a fresh machine",
+        "Do both commands of the README run where there are only Python, its venv and make?",
+    ),
+    Part(
+        "qualification.window",
         "viewer-test",
         "The operator's window",
-        "What do those who look cost the units?",
-        package="qualification",
+        "How much do viewers cost the units?",
     ),
 )
-"""In the order of the report. Those with a limit are what `make bench` runs."""
+"""All parts in the order of the report. `make bench` runs those with a limit."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Curves as pictures."""
+"""Curves as plots."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ SIZE_IN = (7.2, 4.0)
 DPI = 110
 MARKERS = "osD^vP*X"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#888888")
-"""Okabe and Ito's, which people with any kind of colour vision can tell apart."""
+"""Colours of Okabe and Ito, which people with any kind of colour vision can distinguish."""
 
 
 def draw(curves: dict[str, Any], folder: Path, prefix: str) -> Path:
-    """Draw one document of `report.Curves` into `folder`; returns the PNG's path, which its title gives."""
+    """Draw one document of `report.Curves` into `folder`. Return the path of the PNG, named after its title."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -27,7 +27,7 @@ def draw(curves: dict[str, Any], folder: Path, prefix: str) -> Path:
     for number, (name, points) in enumerate(curves["series"].items()):
         marker, colour = MARKERS[number % len(MARKERS)], COLOURS[number % len(COLOURS)]
         x, y = [x for x, _ in points], [y for _, y in points]
-        # What is named first is ours, and lies on top where lines meet.
+        # The first line is ours, and lies on top of the others.
         above = len(curves["series"]) - number + 2
         axes.plot(x, y, label=name, marker=marker, color=colour, markersize=4, linewidth=1.4, zorder=above)
     logarithmic = curves.get("logarithmic", "")
@@ -39,7 +39,7 @@ def draw(curves: dict[str, Any], folder: Path, prefix: str) -> Path:
     axes.grid(alpha=0.3)
     if len(curves["series"]) > 1:
         axes.legend(fontsize="small", frameon=False)
-    # No date and no version in the file: a picture that shows the same is the same.
+    # No date and no version in the file, so that the same plot gives the same file.
     figure.savefig(path, dpi=DPI, metadata={"Software": None})
     plt.close(figure)
     return path

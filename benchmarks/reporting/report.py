@@ -14,15 +14,15 @@ from typing import Any
 from benchmarks.reporting.circumstances import circumstances
 
 RESULTS = Path(__file__).resolve().parents[2] / "out" / "results"
-"""What each run rewrites; no part of the source."""
+"""Folder that each run rewrites. It is no part of the source."""
 
 NUMBERS = re.compile(r"\[\s+((?:(?:-?\d[\d.e+-]*|null),?\s+)+)\]")
-"""A list of nothing but numbers, as `json` breaks it into lines."""
+"""A list of only numbers, as `json` breaks it into lines."""
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A figure that must not be above (`at_most`) or below (`at_least`) a limit; `why` is what is known when it is."""
+    """A figure with an upper (`at_most`) or lower (`at_least`) limit. `why` is the known reason of a miss."""
 
     name: str
     value: float
@@ -32,12 +32,12 @@ class Mark:
 
     @property
     def met(self) -> bool:
-        """A figure that is NaN meets nothing."""
+        """Return True if the figure is within the limit. NaN never is."""
         below = self.at_most is None or self.value <= self.at_most
         return below and (self.at_least is None or self.value >= self.at_least)
 
     def document(self) -> dict[str, Any]:
-        """As plain values, without the bound that it does not have, and without excuse where it needs none."""
+        """Return plain values without an unused bound. `why` is left out if the mark is met."""
         given = {key: _plain(value) for key, value in asdict(self).items() if value is not None}
         if self.met:
             given.pop("why", None)
@@ -50,7 +50,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Result:
-    """What one sweep found: a table, marks, and remarks in words."""
+    """Result of one sweep: a table, marks, and remarks in words."""
 
     title: str
     columns: tuple[str, ...]
@@ -59,7 +59,7 @@ class Result:
     remarks: tuple[str, ...] = ()
 
     def document(self) -> dict[str, Any]:
-        """As plain values; a row is an object by column."""
+        """Return plain values; each row is an object by column."""
         return {
             "title": self.title,
             "rows": [dict(zip(self.columns, map(_plain, row), strict=True)) for row in self.rows],
@@ -74,17 +74,17 @@ class Result:
 
 @dataclass(frozen=True)
 class Curves:
-    """What one picture shows: lines over one axis, by name; labels of axes carry their units."""
+    """One plot: lines over one axis, by name. Labels of axes contain their units."""
 
     title: str
     x_label: str
     y_label: str
     series: Mapping[str, Sequence[tuple[float, float]]]
     logarithmic: str = ""
-    """Axes with equal steps for equal ratios: "", "x", "y" or "xy"."""
+    """Logarithmic axes: "", "x", "y" or "xy"."""
 
     def document(self) -> dict[str, Any]:
-        """As plain values; what was not measured has no point."""
+        """Return plain values. A missing measurement has no point."""
         lines = {
             name: [[_plain(x), _plain(y)] for x, y in points if not math.isnan(y)]
             for name, points in self.series.items()
@@ -93,7 +93,7 @@ class Curves:
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[str | float]]) -> list[str]:
-    """Lines of a table with the columns' names on top; numbers stand to the right."""
+    """Return the lines of a table with the columns' names on top. Numbers are right-aligned."""
     cells = [list(columns)] + [[_text(value) for value in row] for row in rows]
     right = [all(not isinstance(row[i], str) for row in rows) for i in range(len(columns))]
     widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
@@ -104,22 +104,22 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str | float]]) -> list
 
 
 def line(document: dict[str, Any]) -> str:
-    """`document` as one line of JSON."""
+    """Return `document` as one line of JSON."""
     return json.dumps(document, allow_nan=False, separators=(",", ":"))
 
 
 def write(name: str, document: dict[str, Any], folder: Path = RESULTS) -> None:
-    """Leave `document` in `folder`/`name`.json, with the circumstances under which it was `taken`."""
+    """Write `document` to `folder`/`name`.json, with the circumstances in which it was `taken`."""
     folder.mkdir(parents=True, exist_ok=True)
     kept = document | {"taken": circumstances()}
     text = json.dumps(kept, indent=1, allow_nan=False)
-    # What is only numbers stands in one line, so that people can read and compare it.
+    # Lists of only numbers stand in one line, so that people can read and compare them.
     text = NUMBERS.sub(lambda found: f"[{' '.join(found[1].split())}]", text)
     (folder / f"{name}.json").write_text(text + "\n")
 
 
 def _plain(value: str | float) -> str | float | None:
-    """JSON knows no NaN; six digits are more than is known."""
+    """Round to six digits, more than the measurement is precise to. NaN becomes None, because JSON has no NaN."""
     if not isinstance(value, float):
         return value
     return None if math.isnan(value) else float(f"{value:.6g}")

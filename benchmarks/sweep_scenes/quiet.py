@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo cell in which nothing moves but its robot: every voxel that is reported is a false one.
+"""The demo cell, in which only its robot moves: every reported voxel is false.
 
-All that stands still is in CAD, or nothing is and all of it is learned.
+Everything static is either in CAD, or learned.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from simulation.world.world import World
 CAMERAS = 4
 
 FRAME_S = 0.137
-"""Between frames; no part of the robot's period nor of a step's, so that both are met in ever other poses."""
+"""Time between frames. It divides neither the robot's period nor a step's, so the poses of both keep changing."""
 
 LEARNED_FRAMES = 100
-"""Ten seconds of the empty cell at ten frames a second: the robot's shadow fills in."""
+"""Ten seconds of the empty cell at ten frames a second, enough to fill in the robot's shadow."""
 
 LEARNED_S = 0.1
 
 FALSE_SHARE_MAX = 0.005
 
 EXAMPLES = 8
-"""False voxels of a part that are told one by one."""
+"""Number of false voxels of a part that are listed."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Quiet:
-    """What came of a part: frames, frames with false voxels, false voxels, and a few of these in words."""
+    """Results of a part: frames, frames with false voxels, false voxels, and a few of these in words."""
 
     camera: int
     learned: bool
@@ -56,7 +56,7 @@ class Quiet:
 
 
 def parts(frames: int, length: int, learned_too: bool) -> list[Part]:
-    """`frames` of each camera, in parts of at most `length`, in a cell in CAD and, if asked for, in a learned one."""
+    """Return `frames` of each camera in parts of at most `length`, in a cell in CAD and optionally in a learned one."""
     return [
         Part(camera, learned, first, min(first + length, frames))
         for learned in (False, True)[: 1 + learned_too]
@@ -66,7 +66,7 @@ def parts(frames: int, length: int, learned_too: bool) -> list[Part]:
 
 
 def watch(part: Part, intrinsics: Intrinsics, settings: FilterSettings) -> Quiet:
-    """Look at the cell; the joints are those of the frame's time, exactly."""
+    """Filter the frames of one part. The joints are exact at the frame's time."""
     world = World.demo(people=0)
     pose = rig(world.cell, CAMERAS)[part.camera]
     camera = SimulatedCamera(world, pose, intrinsics, renderer="raycast", seed=part.camera)
@@ -91,7 +91,7 @@ def watch(part: Part, intrinsics: Intrinsics, settings: FilterSettings) -> Quiet
 
 
 def result(found: list[Quiet], intrinsics: Intrinsics) -> Result:
-    """One row a camera, and a mark for each kind of cell."""
+    """Return one row per camera, and a mark for each kind of cell."""
     rows: list[tuple[str | float, ...]] = []
     marks = []
     for learned in sorted({each.learned for each in found}):
@@ -113,7 +113,7 @@ def result(found: list[Quiet], intrinsics: Intrinsics) -> Result:
 
 
 def _counts(found: list[Quiet]) -> tuple[int, int, int, float]:
-    """Frames, those with false voxels, false voxels, share of the second in per cent."""
+    """Return frames, frames with false voxels, false voxels, and the share of the second in per cent."""
     frames, false_frames = sum(each.frames for each in found), sum(each.false_frames for each in found)
     return frames, false_frames, sum(each.false_voxels for each in found), 100.0 * false_frames / max(frames, 1)
 

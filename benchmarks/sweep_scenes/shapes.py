@@ -21,13 +21,13 @@ from simulation.world.scene import Body, Owner
 
 VOXELS_M = (0.02, 0.05)
 ROOM_M = 1.0
-"""The known floor lies this far below the thing: beyond every margin, and things throw a shadow on it."""
+"""Distance of the known floor below the thing: beyond every margin. Things cast a shadow on it."""
 
 PLATE_M, PLATE_THICK_M = 0.10, 0.002
 PLATE_DISTANCES_M = (1.0, 1.5, 2.0)
 PLATE_VOXEL_M = 0.05
 PLATE_PLACES = (0.0, 0.25, 0.5)
-"""Middle of the plate along x and along y, in voxels from a voxel's corner: on a corner it is split most evenly."""
+"""Centre of the plate along x and along y, in voxels from a voxel's corner. On a corner it is split most evenly."""
 
 ROD_DISTANCE_M, ROD_RADIUS_M, ROD_LENGTH_M = 1.5, 0.01, 0.30
 ROD_TILT_MAX_DEG = 60.0
@@ -36,15 +36,15 @@ ROD_PLACES_M = 0.3
 
 SPECKLE_DISTANCE_M, SPECKLE_PX = 1.5, 20
 SPECKLE_MARGIN_PX = 40
-"""Speckle keeps away from the picture's border, where its voxels would be outside the cell."""
+"""Distance of speckle from the image border, where its voxels would be outside the cell."""
 
 Rules = dict[str, FilterSettings]
 Lost = dict[str, int]
-"""How many of a number of frames were lost (or, of speckle, reported) by each rule."""
+"""Number of frames in which each rule lost the thing (speckle: reported it)."""
 
 
 def rules(settings: FilterSettings, voxel_size_m: float) -> Rules:
-    """The rules that are compared, by name, with voxels of one size; ours is the first."""
+    """Return the compared rules by name, for one voxel size; ours is the first."""
     ours = settings.model_copy(update={"voxel_size_m": voxel_size_m})
     paper = {"density_rule": "single", "density_model": "angular"}
     return {
@@ -60,7 +60,7 @@ CAMERAS = {"perfect": DepthNoise.none(), "D435i": DepthNoise()}
 
 @dataclass(frozen=True)
 class Tally:
-    """What came of one kind of thing before one camera: `lost` of `frames` by each rule."""
+    """Results of one kind of thing with one camera: `lost` of `frames` by each rule."""
 
     thing: str
     camera: str
@@ -74,7 +74,7 @@ class Tally:
 
 
 def plates(camera: str, distance_m: float, step_m: float, settings: FilterSettings) -> Tally:
-    """A plate that faces the camera, moved in steps through the depth of two voxels."""
+    """Move a plate that faces the camera in steps through the depth of two voxels."""
     stage = above_table(distance_m + ROOM_M, CAMERAS[camera], seed=3)
     pipelines = _pipelines(stage, settings, PLATE_VOXEL_M)
     mesh = box_mesh("plate", (PLATE_M, PLATE_M, PLATE_THICK_M))
@@ -94,7 +94,7 @@ def plates(camera: str, distance_m: float, step_m: float, settings: FilterSettin
 
 
 def rods(camera: str, voxel_m: float, tilt_max_deg: float, poses: int, settings: FilterSettings) -> Tally:
-    """A rod at another place and in another direction in each frame.
+    """Show a rod at another place and in another direction in each frame.
 
     Up to 60 degrees from the image plane all tilts are equally frequent; at 90, all directions of space.
     """
@@ -121,7 +121,7 @@ def _rod_pose(rng: np.random.Generator, tilt_max_deg: float) -> Transform:
 
 
 def speckle(voxel_m: float, frames: int, settings: FilterSettings) -> Tally:
-    """A blob of up to 20 pixels, of another size, shape and place in each frame, before a known floor.
+    """Show a blob of up to 20 pixels before a known floor, with another size, shape and place in each frame.
 
     Counts the frames in which it is reported; half of them have the largest blob.
     """
@@ -134,7 +134,7 @@ def speckle(voxel_m: float, frames: int, settings: FilterSettings) -> Tally:
         depth = stage.frame().depth
         pixels = SPECKLE_PX if k % 2 else int(rng.integers(1, SPECKLE_PX + 1))
         rows, columns = blob(rng, pixels, stage.intrinsics)
-        # A blob is one wrong match: all of it lies at one depth, but for the noise of each pixel.
+        # A blob is one wrong match: all of it lies at one depth, except for the noise of each pixel.
         z_m = SPECKLE_DISTANCE_M + sigma_m * (rng.standard_normal() + math.sqrt(0.1) * rng.standard_normal(pixels))
         depth[rows, columns] = np.round(z_m / stage.intrinsics.depth_scale_m).astype(np.uint16)
         for rule, pipeline in pipelines.items():
@@ -143,7 +143,7 @@ def speckle(voxel_m: float, frames: int, settings: FilterSettings) -> Tally:
 
 
 def blob(rng: np.random.Generator, pixels: int, intrinsics: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns (pixels,) of a random connected blob."""
+    """Return the rows and columns (pixels,) of a random connected blob."""
     start = rng.integers(SPECKLE_MARGIN_PX, np.array(intrinsics.shape) - SPECKLE_MARGIN_PX)
     found = {(int(start[0]), int(start[1]))}
     while len(found) < pixels:
@@ -158,7 +158,7 @@ def blob(rng: np.random.Generator, pixels: int, intrinsics: Intrinsics) -> tuple
 
 
 def result(tallies: list[Tally]) -> Result:
-    """The table, and the marks of our rule."""
+    """Return the table, and the marks of our rule."""
     names = list(tallies[0].lost)
     rows: list[tuple[str | float, ...]] = []
     for t in tallies:
@@ -181,12 +181,12 @@ def _marks(tallies: list[Tally], ours: str) -> list[Mark]:
 
 
 def _pipelines(stage: Stage, settings: FilterSettings, voxel_m: float) -> dict[str, DepthPipeline]:
-    """A filter for each of the rules."""
+    """Return a filter for each of the rules."""
     return {rule: stage.pipeline(chosen) for rule, chosen in rules(settings, voxel_m).items()}
 
 
 def _tally(stage: Stage, body: Body, pipelines: dict[str, DepthPipeline], lost: Lost) -> None:
-    """One frame with `body` before every rule."""
+    """Filter one frame with `body` by every rule."""
     depth = stage.frame(body).depth
     for rule, pipeline in pipelines.items():
         lost[rule] += not reported_at(pipeline.process(depth, None).voxels, body)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One D435i, faults and all, and things before it: a bare scene whose every pixel is a ray cast by Embree.
+"""One D435i with its faults, and things before it: a bare scene, with a ray cast by Embree for each pixel.
 
-`make sweeps` has the camera look straight down at a table: the world's z axis points at it, and the table's top is at
-z = 0. `make bench-accuracy` has a wall, see `benchmarks.ground_truth.things`.
+In `make sweeps` the camera looks straight down at a table: the world's z axis points at the camera, and the table's top
+is at z = 0. `make bench-accuracy` has a wall, see `benchmarks.ground_truth.things`.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from simulation.world.world import World
 FACING_DOWN = np.diag((1.0, -1.0, -1.0))
 
 HALF_WIDTH_M = 4.0
-"""The table fills the picture of a D435i up to 3 m above it."""
+"""Half the width of the table. It fills the image of a D435i up to 3 m above it."""
 
 CELL_HALF_M = 1.0
-"""Things stand within this of the optical axis; the cell is no larger, so that it is quick to make."""
+"""Half the width of the cell. Things stand within this of the optical axis; a small cell is quick to make."""
 
 SLAB_THICK_M = 0.02
 
@@ -39,7 +39,7 @@ BLUR_M = 0.05
 
 
 class Stage:
-    """A D435i in a cell whose static bodies are all that stands still; things are put before it for one frame."""
+    """A D435i in a cell that contains all static bodies. Things are added for one frame."""
 
     def __init__(self, T_world_camera: Transform, cell: Cell, noise: DepthNoise, seed: int) -> None:
         self.intrinsics = d435i_intrinsics()
@@ -51,18 +51,18 @@ class Stage:
         self._moment = 0
 
     def frame(self, *things: Body) -> SimulatedFrame:
-        """The next frame with `things` on the stage; no two frames have the same noise."""
+        """Return the next frame with `things` on the stage. Each frame has noise of its own."""
         self._moment += 1
         view = self._renderer.render(replace(self._empty, moving=things))
         return SimulatedFrame(self._sensor.measure(view.z_m, self._moment), view, None)
 
     def pipeline(self, settings: FilterSettings, cell: Cell | None = None) -> DepthPipeline:
-        """A filter for this camera, in the stage's own cell unless it is to take it for another."""
+        """Return a filter for this camera in `cell`, by default in the stage's own cell."""
         return DepthPipeline(self.intrinsics, self.T_world_camera, cell or self.cell, settings)
 
 
 def above_table(height_m: float, noise: DepthNoise, seed: int) -> Stage:
-    """A camera that hangs `height_m` above the middle of a table."""
+    """Return a stage with a camera `height_m` above the middle of a table."""
     table = slab("table", 2.0 * HALF_WIDTH_M, from_rotation_translation(np.eye(3), (0.0, 0.0, -0.5 * SLAB_THICK_M)))
     low, high = (-CELL_HALF_M, -CELL_HALF_M, -0.5), (CELL_HALF_M, CELL_HALF_M, 3.0)
     cell = Cell("stage", np.array(low), np.array(high), (table,))
@@ -70,12 +70,14 @@ def above_table(height_m: float, noise: DepthNoise, seed: int) -> Stage:
 
 
 def slab(name: str, side_m: float, T_world_middle: Transform) -> PlacedMesh:
-    """A square slab, `SLAB_THICK_M` along its z."""
+    """Return a square slab, `SLAB_THICK_M` along its z."""
     return PlacedMesh(name, box_mesh(name, (side_m, side_m, SLAB_THICK_M)), T_world_middle)
 
 
 def lying(heading_rad: float, tilt_rad: float) -> NDArray[np.float64]:
-    """A rotation (3, 3) that turns z, a cylinder's axis, to `heading_rad` in the xy plane and `tilt_rad` out of it."""
+    """Return a rotation (3, 3) that turns z, a cylinder's axis, to `heading_rad` in the xy plane and `tilt_rad` out of
+    it.
+    """
     x, y = math.cos(heading_rad), math.sin(heading_rad)
     axis = np.array((math.cos(tilt_rad) * x, math.cos(tilt_rad) * y, math.sin(tilt_rad)))
     side = np.array((-y, x, 0.0))
@@ -83,7 +85,7 @@ def lying(heading_rad: float, tilt_rad: float) -> NDArray[np.float64]:
 
 
 def reported_at(voxels: Voxels, body: Body) -> bool:
-    """Whether a voxel is reported where `body` stands: within a voxel and `BLUR_M` of its bounding box."""
+    """Return True if a voxel is reported within one voxel and `BLUR_M` of the bounding box of `body`."""
     if not len(voxels):
         return False
     points = apply(body.T_world_mesh, body.mesh.vertices)

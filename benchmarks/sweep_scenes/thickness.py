@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How thin a thing on a table may be before it is lost in the table's margin.
+"""Thinnest thing on a table that is not lost in the table's margin.
 
-A box of 10 x 10 cm, at another place and turned another way in each frame, on a table that fills the picture of a
+A box of 10 x 10 cm lies at another place and in another orientation in each frame. The table fills the image of a
 camera straight above. The table is in CAD, or learned.
 """
 
@@ -23,32 +23,32 @@ from simulation.cameras.depth_noise import DepthNoise
 from simulation.world.scene import Body, Owner
 
 SIDE_M = 0.10
-"""A hand, or a tool left behind."""
+"""Side of a hand, or of a forgotten tool."""
 
 PLACES_M = 0.25
-"""Boxes stand within this of the optical axis: inside the picture at half a metre."""
+"""Largest distance of a box from the optical axis: inside the image at half a metre."""
 
 MARKED = ((1.0, 0.070), (2.0, 0.130))
-"""Distance of the table, height of a box that must be reported there."""
+"""Distance of the table, and height of a box that must be reported there."""
 
 REPORTED_SHARE = 0.99
 EMPTY_SHARE_MAX = 0.005
 
 STEP_M = 0.005
-"""Heights are tried in these steps."""
+"""Step between the heights."""
 
 HIGHEST_M, CLEARANCE_M = 0.6, 0.25
-"""The highest box that is tried, and how far below the camera it must end: nearer than 0.2 m nothing is measured."""
+"""The highest box, and its smallest distance from the camera: nearer than 0.2 m nothing is measured."""
 
 LEARNED_FRAMES = 60
 """Two seconds of the empty table."""
 
 SHIFTS = 5
-"""The lattice begins at this many heights relative to the table's top."""
+"""Number of heights of the lattice's origin relative to the table's top."""
 
 
 class Trial:
-    """Boxes on a table at one distance, before one filter."""
+    """Boxes on a table at one distance, with one filter."""
 
     def __init__(self, distance_m: float, cad: bool, settings: FilterSettings, seed: int) -> None:
         self._stage = above_table(distance_m, DepthNoise(), seed)
@@ -64,7 +64,7 @@ class Trial:
                 pipeline.use(reference)
 
     def reported_share(self, height_m: float, frames: int) -> float:
-        """Share of the frames in which a box of `height_m` is reported."""
+        """Return the share of the frames in which a box of `height_m` is reported."""
         rng = np.random.default_rng((self._seed, round(height_m * 1e4)))
         mesh = _box(height_m)
         found = 0
@@ -76,12 +76,12 @@ class Trial:
         return found / frames
 
     def empty_share(self, frames: int) -> float:
-        """Share of the frames of the empty table in which anything is reported."""
+        """Return the share of the frames of the empty table in which anything is reported."""
         found = sum(len(self._voxels(i)) > 0 for i in range(frames))
         return found / frames
 
     def thinnest_m(self, frames: int) -> float:
-        """The thinnest box, in whole steps, that is reported often enough; NaN when not even the highest is."""
+        """Return the thinnest box, in whole steps, that is reported often enough; NaN if not even the highest is."""
         lost, kept = 0, round(self._highest_m / STEP_M)
         if self.reported_share(kept * STEP_M, frames) < REPORTED_SHARE:
             return math.nan
@@ -94,13 +94,13 @@ class Trial:
         return kept * STEP_M
 
     def _voxels(self, i: int, *boxes: Body) -> Voxels:
-        """What is reported of the next frame, on the lattice whose turn it is."""
+        """Return the voxels of the next frame, on the lattice whose turn it is."""
         return self._pipelines[i % SHIFTS].process(self._stage.frame(*boxes).depth, None).voxels
 
 
 @dataclass(frozen=True)
 class AtMark:
-    """What came of boxes of one height: shares of the frames with a box, and of those without."""
+    """Results for boxes of one height: share of reported frames with a box, and without."""
 
     distance_m: float
     height_m: float
@@ -111,14 +111,14 @@ class AtMark:
 
 
 def trial(distance_m: float, height_m: float, cad: bool, frames: int, settings: FilterSettings) -> AtMark:
-    """Boxes of one height on one table."""
+    """Test boxes of one height on one table."""
     boxes = Trial(distance_m, cad, settings, seed=1)
     reported = boxes.reported_share(height_m, frames)
     return AtMark(distance_m, height_m, cad, frames, reported, boxes.empty_share(frames))
 
 
 def at_the_marks(found: list[AtMark]) -> Result:
-    """The table, and the marks of those on CAD; a box is no feat where the empty table is reported, too."""
+    """Return the table, and the marks on CAD. A reported box means nothing if the empty table is reported, too."""
     rows = tuple(
         (_KIND[each.cad], each.distance_m, 1e3 * each.height_m, each.frames, *_percents(each)) for each in found
     )
@@ -133,13 +133,13 @@ def at_the_marks(found: list[AtMark]) -> Result:
 
 
 def point(distance_m: float, frames: int, settings: FilterSettings) -> tuple[float, float, float]:
-    """Distance in metres; in mm the thinnest box that is reported, on a CAD table and on a learned one."""
+    """Return the distance in metres, and the thinnest reported box in mm on a CAD table and on a learned one."""
     cad, learned = (Trial(distance_m, kind, settings, seed=2).thinnest_m(frames) for kind in (True, False))
     return distance_m, 1e3 * cad, 1e3 * learned
 
 
 def curve(points: list[tuple[float, float, float]], frames: int) -> Result:
-    """The thinnest boxes as a table."""
+    """Return the thinnest boxes as a table."""
     return Result(
         f"Thinnest box of 10 x 10 cm that is reported in at least 99 % of {frames} frames",
         ("distance m", "on a CAD table mm", "on a learned table mm"),

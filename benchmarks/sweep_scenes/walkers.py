@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""People in the demo cell: how much of their visible surface is missed, and what is reported where nobody is.
+"""People in the demo cell: the missed share of their visible surface, and the false voxels.
 
-As `simulation.cameras.truth` has it, a voxel is visible to a camera when it shows a tenth of the pinhole count, and
-outside the margin when as many of these points pass the filter at their true depth. It is missed when the merged map of
-all cameras holds neither it nor one of its 26 neighbours (strictly: not it itself); alone, when its own camera reported
-neither. A report is false when nothing unknown has a surface in it or in a neighbour.
+As in `simulation.cameras.truth`, a voxel is visible to a camera if it shows a tenth of the pinhole count. It is outside
+the margin if as many of these points pass the filter at their true depth. It is missed if the merged map of all cameras
+holds neither it nor one of its 26 neighbours; strictly missed if the map does not hold the voxel itself; missed by its
+own camera if that camera reported neither. A report is false if nothing unknown has a surface in it or in a neighbour.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Walk:
-    """Counts over frames of one number of people; voxels are counted anew in each camera's frame."""
+    """Counts over frames of one number of people. Voxels are counted again in each camera's frame."""
 
     people: int
     frames: int = 0
@@ -54,7 +54,7 @@ class Walk:
 
 
 def parts(people: int, moments: int, length: int) -> list[Part]:
-    """`moments` of a cell, in parts of at most `length`."""
+    """Return `moments` of a cell in parts of at most `length`."""
     return [Part(people, first, min(first + length, moments)) for first in range(0, moments, length)]
 
 
@@ -70,7 +70,7 @@ class _Watcher:
         self._scale_m = intrinsics.depth_scale_m
 
     def look(self, t_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Keys of the voxels that are reported, visible, visible and outside the margin, and of surfaces."""
+        """Return the keys of the voxels that are reported, visible, visible and outside the margin, and of surfaces."""
         frame = self.camera.capture(t_s)
         reported = self.pipeline.process(frame.depth, frame.joints).voxels.keys
         true_raw = np.where(np.isfinite(frame.true_z_m), np.rint(frame.true_z_m / self._scale_m), 0.0)
@@ -80,7 +80,7 @@ class _Watcher:
 
 
 def watch(part: Part, intrinsics: Intrinsics, settings: FilterSettings) -> Walk:
-    """Look at the cell; the joints are those of the frame's time, exactly."""
+    """Filter the frames of one part. The joints are exact at the frame's time."""
     world = World.demo(people=part.people)
     watchers = [_Watcher(world, index, intrinsics, settings) for index in range(CAMERAS)]
     lattice = watchers[0].pipeline.lattice
@@ -105,7 +105,7 @@ def watch(part: Part, intrinsics: Intrinsics, settings: FilterSettings) -> Walk:
 
 
 def result(found: list[Walk], intrinsics: Intrinsics) -> Result:
-    """One row a number of people."""
+    """Return one row per number of people."""
     rows: list[tuple[str | float, ...]] = []
     marks: list[Mark] = []
     for people in sorted({walk.people for walk in found}):

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibration board in one picture: which of its points are seen, and where to a few hundredths of a pixel.
+"""Detection of the calibration board in one image: its seen points, to a few hundredths of a pixel.
 
-OpenCV finds the markers; where exactly their corners are decides the accuracy. A marker's corner is an L that blur
-rounds off, so `cornerSubPix` is drawn inwards by it; a ChArUco board's inner corners have no such bias, but few pixels
-tell of each. Here straight lines are fitted to each marker's four edges and intersected: an edge is steepest where it
-was without blur, whichever way that blurs, and a line averages over all of its pixels. At 3 m the camera's position is
-off by a ninth of what `cornerSubPix` on markers gives, and by less than half of what the inner corners of ChArUco
-boards give, so their markers are used just as those of grids. OpenCV's AprilTag refinement fits lines as well, but
-takes half a second a picture and finds no small markers.
+OpenCV finds the markers; the exact position of their corners decides the accuracy. A marker's corner is an L that blur
+rounds off, which draws `cornerSubPix` inwards. The inner corners of a ChArUco board have no such bias, but few pixels
+contribute to each. Here straight lines are fitted to each marker's four edges and intersected: symmetric blur does not
+move the steepest point of an edge, and a line averages over all of its pixels. At 3 m the error of the camera's
+position is a ninth of the error with `cornerSubPix` on markers, and less than half of the error with the inner corners
+of ChArUco boards. So the markers of ChArUco boards are used like those of grids. OpenCV's AprilTag refinement also fits
+lines, but takes half a second an image and finds no small markers.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ EDGE_SAMPLES = 24
 """Along each edge of a marker."""
 
 EDGE_ENDS = 0.12
-"""Of an edge at either end that is left out: there the corner's blur begins."""
+"""Part of an edge at either end that is left out: there the corner's blur begins."""
 
 PROFILE_STEP_PX = 0.25
 PROFILE_REACH_PX = 3.0
 MIN_REACH_PX = 1.0
 QUIET = 0.8
-"""Across an edge, to either side; less where the next edge, of the code or of a square, is within this share of it."""
+"""Reach across an edge, to either side; less if the next edge, of code or square, is within this share of it."""
 
 REFINEMENTS = 2
-"""The second begins on the line that the first found, so that its window lies symmetrical about the edge."""
+"""The second pass starts on the line of the first, so that its window lies symmetrically about the edge."""
 
 MAX_SHIFT_PX = 2.5
-"""Of a corner by its refinement; farther off it is none of this marker's."""
+"""The most that refinement may move a corner; beyond, the edges are not this marker's."""
 
 SAME_PLACE_PX = 4.0
-"""How far a point may be from where most others say it is; beyond, its marker is not this board's."""
+"""The largest distance of a point from the consensus of the others; beyond, its marker is not this board's."""
 
 MIN_POINTS = 6
-"""Four determine a homography; two more tell whether it is right."""
+"""Four determine a homography; two more verify it."""
 
 MIN_AGREEING = 0.75
 """Share of the points that must lie as on the board."""
@@ -51,13 +51,13 @@ MIN_AGREEING = 0.75
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """What one picture shows of the board.
+    """Seen points of the board in one image.
 
     Attributes:
         points_m: (N, 3) seen points in the board's frame.
-        pixels: (N, 2) where they are in the picture, less the lens's distortion.
-        point_ids: (N,) which of the board's points they are.
-        markers: how many of the board's markers were seen, whether or not they lie as they should.
+        pixels: (N, 2) their pixels in the image, undistorted.
+        point_ids: (N,) their indices among the board's points.
+        markers: number of the board's markers seen, in agreement with the board or not.
         marker_px: median edge of these, pixels.
         agreeing: share of the points that lie as on the board.
     """
@@ -71,7 +71,7 @@ class Detection:
 
     @property
     def fits(self) -> bool:
-        """Whether a pose can be had from it."""
+        """True if a pose can be computed from it."""
         return len(self.points_m) >= MIN_POINTS and self.agreeing >= MIN_AGREEING
 
 
@@ -79,7 +79,7 @@ NOTHING = Detection(np.empty((0, 3)), np.empty((0, 2)), np.empty(0, dtype=np.int
 
 
 class BoardDetector:
-    """Looks for one board in the pictures of one lens."""
+    """Detects one board in the images of one lens."""
 
     def __init__(
         self,
@@ -103,7 +103,7 @@ class BoardDetector:
         self._quiet_share = QUIET * min(cell_share, gap_share)
 
     def detect(self, image: NDArray[np.uint8]) -> Detection:
-        """The board in a picture (H, W) grey or (H, W, 3) RGB; other markers, and this board's elsewhere, are left."""
+        """Detect the board in an image (H, W) grey or (H, W, 3) RGB; ignores other markers, and copies of its own."""
         grey: NDArray[np.uint8] = np.ascontiguousarray(
             image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8
         )
@@ -117,14 +117,14 @@ class BoardDetector:
         if len(points_m) < MIN_POINTS:
             return Detection(points_m, pixels, point_ids, seen, marker_px, 1.0)
         _, inliers = cv2.findHomography(points_m[:, :2], pixels, cv2.RANSAC, SAME_PLACE_PX)
-        # OpenCV gives none at all where points are degenerate.
+        # OpenCV returns None for degenerate points.
         flags = np.ravel(inliers)
         lie = flags.astype(bool) if len(flags) == len(points_m) else np.zeros(len(points_m), bool)
         agreeing = float(lie.mean())
         return Detection(points_m[lie], pixels[lie], point_ids[lie], seen, marker_px, agreeing)
 
     def _own_markers(self, grey: NDArray[np.uint8]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-        """Corners (K, 4, 2) and ids (K,) of markers that the board has."""
+        """Return corners (K, 4, 2) and ids (K,) of the markers that belong to the board."""
         found, ids, _ = self._markers.detectMarkers(grey)
         if not len(found):
             return np.empty((0, 4, 2)), np.empty(0, dtype=np.intp)
@@ -135,7 +135,7 @@ class BoardDetector:
     def _corners_of(
         self, grey: NDArray[np.uint8], corners: NDArray[np.float64], ids: NDArray[np.intp]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.intp]]:
-        """Marker corners, by their edges."""
+        """Return marker corners, refined by their edges."""
         refined = refined_corners(grey, corners, self._quiet_share)
         rows = ids - self.layout.ids[0]
         flat_m = self.layout.marker_corners_m[rows].reshape(-1, 2)
@@ -147,10 +147,10 @@ class BoardDetector:
 
 
 def refined_corners(grey: NDArray[np.uint8], corners: NDArray[np.float64], quiet_share: float) -> NDArray[np.float64]:
-    """Corners (K, 4, 2) of black markers on white as intersections of lines fitted to their edges; NaN where none is.
+    """Return corners (K, 4, 2) of black markers on white: intersections of lines fitted to their edges; NaN on failure.
 
-    `corners` go round each marker; `quiet_share`, of a marker's edge, is how far to either side of it
-    there is nothing but black and white.
+    `corners` go round each marker; `quiet_share`, of a marker's edge, is the width to either side of it that holds
+    nothing but black and white.
     """
     refined = corners
     for _ in range(REFINEMENTS):
@@ -163,7 +163,7 @@ def refined_corners(grey: NDArray[np.uint8], corners: NDArray[np.float64], quiet
 def _edge_lines(
     grey: NDArray[np.uint8], corners: NDArray[np.float64], quiet_share: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A point (K, 4, 2) and a direction (K, 4, 2) of the line along the edge from each corner to the next."""
+    """Return a point (K, 4, 2) and a direction (K, 4, 2) of the line along the edge from each corner to the next."""
     following = np.roll(corners, -1, axis=1)
     along = following - corners
     length = np.linalg.norm(along, axis=2, keepdims=True)
@@ -185,14 +185,14 @@ def _edge_lines(
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     ).reshape(samples.shape[:-1])
-    # Black inside, white outside: what rises outwards is the edge, and its centroid where it is steepest.
+    # Black inside, white outside: the edge is the outward rise; its centroid is the steepest point.
     rise = np.diff(values, axis=3)
     middles = 0.5 * (offsets[..., 1:] + offsets[..., :-1])[:, :, None]
     weight = np.maximum(rise, 0.0)
     total = weight.sum(axis=3)
     offset = np.sum(weight * middles, axis=3) / np.maximum(total, 1e-9)
     seen = on_edge + offset[..., None] * normal[:, :, None]
-    # Total least squares, each sample by how much of an edge it has.
+    # Total least squares; each sample is weighted by the strength of its edge.
     share = total / np.maximum(total.sum(axis=2, keepdims=True), 1e-9)
     centre = np.sum(share[..., None] * seen, axis=2)
     off = seen - centre[:, :, None]
@@ -202,7 +202,7 @@ def _edge_lines(
 
 
 def _intersections(centre: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where each edge's line meets that of the edge before: the corners (K, 4, 2)."""
+    """Return the intersections of each edge's line with the line of the edge before: the corners (K, 4, 2)."""
     before, before_direction = np.roll(centre, 1, axis=1), np.roll(direction, 1, axis=1)
     cross = before_direction[..., 0] * direction[..., 1] - before_direction[..., 1] * direction[..., 0]
     gap = centre - before
@@ -213,21 +213,21 @@ def _intersections(centre: NDArray[np.float64], direction: NDArray[np.float64]) 
 
 @dataclass(frozen=True, eq=False)
 class _Lens:
-    """Takes a lens's distortion out of pixels."""
+    """Removes a lens's distortion from pixels."""
 
     intrinsics: Intrinsics
     distortion: NDArray[np.float64]
     model: str
 
     def rectified(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where the same points were, had the lens none: (N, 2)."""
+        """Return the undistorted positions (N, 2) of the points."""
         if not self.distortion.any() or not len(pixels):
             return pixels
         camera = self.intrinsics
         matrix = np.array(((camera.fx, 0.0, camera.cx), (0.0, camera.fy, camera.cy), (0.0, 0.0, 1.0)))
         if "inverse" not in self.model:
             return cv2.undistortPoints(pixels[:, None], matrix, self.distortion, P=matrix)[:, 0].astype(np.float64)
-        # The SDK's inverse model is the polynomial from the picture to the ray, so nothing is to be inverted.
+        # The SDK's inverse model is the polynomial from the image to the ray, so nothing is inverted here.
         k1, k2, p1, p2, k3 = self.distortion
         x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
         square = x * x + y * y

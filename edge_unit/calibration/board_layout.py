@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibration board on paper: what is printed where, in the board's own frame.
+"""The calibration board on paper: positions of all printed parts, in the board's own frame.
 
-All of it comes from OpenCV's board, by which cameras detect it too: printed, detected and simulated boards are one.
+All of it comes from OpenCV's board, which cameras also detect: printed, detected and simulated boards are one.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ BORDER_CELLS = 1
 
 @dataclass(frozen=True, eq=False)
 class BoardLayout:
-    """A board as OpenCV knows it.
+    """A board in OpenCV's terms.
 
     Attributes:
-        board: as the cell has it.
-        aruco: OpenCV's own.
-        dictionary: of its markers.
-        ids: (M,) of its markers.
+        board: the board's description in the cell.
+        aruco: OpenCV's board object.
+        dictionary: the dictionary of its markers.
+        ids: (M,) ids of its markers.
         marker_corners_m: (M, 4, 2) x and y in the board's frame, clockwise as printed from the top left.
         size_m: width and height of the printed pattern.
     """
@@ -41,10 +41,10 @@ class BoardLayout:
 
     @classmethod
     def of(cls, board: Board) -> BoardLayout:
-        """Lay it out.
+        """Make the layout of `board`.
 
         Raises:
-            CellError: OpenCV has no such dictionary, or too few markers in it.
+            CellError: OpenCV has no such dictionary, or the dictionary has too few markers.
         """
         name = board.dictionary
         number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
@@ -77,7 +77,7 @@ class BoardLayout:
 
     @property
     def black_m(self) -> NDArray[np.float64]:
-        """(R, 4) rectangles x0, y0, x1, y1 in the board's frame that are printed black; none overlaps another."""
+        """Return (R, 4) rectangles x0, y0, x1, y1, in the board's frame, of all black areas; none overlaps another."""
         found: list[tuple[float, float, float, float]] = []
         board = self.board
         if board.kind == "charuco":
@@ -93,7 +93,7 @@ class BoardLayout:
             (x_m, y_m), cell_m = corners_m[0], board.marker_m / cells
             code = self.dictionary.generateImageMarker(int(marker_id), cells, None, BORDER_CELLS)
             for row, line in enumerate(code):
-                # Whole runs: seams between cells would show in print.
+                # Whole runs: seams between cells would be visible in print.
                 edges = np.flatnonzero(np.diff(np.concatenate(([255], line, [255])).astype(np.int16)))
                 for first, last in edges.reshape(-1, 2):
                     found.append(
@@ -103,10 +103,10 @@ class BoardLayout:
 
 
 def require_board(board: Board | None) -> Board:
-    """The cell's board.
+    """Return the cell's board.
 
     Raises:
-        InputError: it has none.
+        InputError: the cell has no board.
     """
     if board is None:
         raise InputError("the cell has no board: describe the printed one under `board` in cell.yaml")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibration board as a PDF at exact scale: vectors only, with a ruler by which the print is checked."""
+"""The calibration board as a PDF at exact scale: vectors only, with a ruler to check the print."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ PAPER_MARGIN_MM = 5.0
 """Most printers leave this much of the paper white."""
 
 QUIET_MM = 5.0
-"""White at least about the pattern, so that its outermost black is found."""
+"""Least white border of the pattern, so that its outermost black is found."""
 
 FOOT_MM = 21.0
-"""Below it: the ruler, and what the board is."""
+"""Space below the pattern, for the ruler and the description of the board."""
 
 RULER_MM = 100
-"""Measured after printing: printers like to shrink what they think does not fit."""
+"""Length to measure after printing: printers often shrink a page to fit."""
 
 AXIS_MM = 15.0
-"""Of the frame's arrows, in the white beside the pattern's top left corner."""
+"""Length of the frame's arrows, in the white beside the pattern's top left corner."""
 
 
 @dataclass(frozen=True)
 class Page:
-    """A sheet, the way round in which the board fits. `left_mm`, `top_mm`: where the pattern's top left corner is."""
+    """A sheet, in the orientation that fits the board. `left_mm`, `top_mm`: the pattern's top left corner."""
 
     name: str
     width_mm: float
@@ -45,10 +45,10 @@ class Page:
 
 
 def page_of(layout: BoardLayout, name: str) -> Page:
-    """The sheet of this name, upright or lying.
+    """Return the sheet of this name, portrait or landscape.
 
     Raises:
-        InputError: there is no such sheet, or the board does not fit; the text tells which it fits.
+        InputError: there is no such sheet, or the board does not fit; the text names the sheets that it fits.
     """
     if name.upper() not in PAGES:
         raise InputError(f"page: expected one of {', '.join(PAGES)}, got {name}")
@@ -64,10 +64,10 @@ def page_of(layout: BoardLayout, name: str) -> Page:
 
 
 def smallest_page(layout: BoardLayout) -> str:
-    """The name of the smallest sheet that the board fits on.
+    """Return the name of the smallest sheet that fits the board.
 
     Raises:
-        InputError: it fits on none.
+        InputError: no sheet fits.
     """
     for name in PAGES:
         if _fitting(layout, name) is not None:
@@ -82,10 +82,10 @@ def write_board(layout: BoardLayout, path: Path, page: Page) -> None:
         ConfigError: the file cannot be written.
     """
     size = (page.width_mm * POINTS_PER_MM, page.height_mm * POINTS_PER_MM)
-    # Uncompressed it is a few kilobytes, and anyone can check its numbers.
+    # Uncompressed it is a few kilobytes, and its numbers can be checked by eye.
     canvas = Canvas(str(path), pagesize=size, pageCompression=0, invariant=1)
     canvas.setTitle(_title(layout))
-    # From here on in mm from the pattern's top left corner, y down, as the board's frame.
+    # From here on in mm from the pattern's top left corner, y down, like the board's frame.
     canvas.translate(page.left_mm * POINTS_PER_MM, (page.height_mm - page.top_mm) * POINTS_PER_MM)
     canvas.scale(POINTS_PER_MM, -POINTS_PER_MM)
     canvas.setFillGray(0.0)
@@ -103,7 +103,7 @@ def write_board(layout: BoardLayout, path: Path, page: Page) -> None:
 def _fitting(layout: BoardLayout, name: str) -> Page | None:
     width_mm, height_mm = (1e3 * side for side in layout.size_m)
     short_mm, long_mm = (side / POINTS_PER_MM for side in getattr(pagesizes, name))
-    # Beside and above the pattern the frame's arrows are drawn into the white.
+    # The frame's arrows are drawn into the white beside and above the pattern.
     beside_mm = PAPER_MARGIN_MM + QUIET_MM
     for page_width_mm, page_height_mm in ((short_mm, long_mm), (long_mm, short_mm)):
         free_mm = page_width_mm - width_mm
@@ -125,7 +125,7 @@ def _title(layout: BoardLayout) -> str:
 
 
 def _draw_frame(canvas: Any) -> None:
-    """Origin and axes, just outside the pattern."""
+    """Draw origin and axes, just outside the pattern."""
     out_mm = 2.5
     canvas.setLineWidth(0.3)
     for along_x in (True, False):
@@ -142,7 +142,7 @@ def _draw_frame(canvas: Any) -> None:
 
 
 def _draw_foot(canvas: Any, layout: BoardLayout, page: Page) -> None:
-    """The ruler, and in words what the board is."""
+    """Draw the ruler, and the description of the board."""
     top_mm = 1e3 * layout.size_m[1] + QUIET_MM
     left_mm = PAPER_MARGIN_MM + QUIET_MM - page.left_mm
     canvas.setLineWidth(0.15)
@@ -159,7 +159,7 @@ def _draw_foot(canvas: Any, layout: BoardLayout, page: Page) -> None:
 
 
 def _text(canvas: Any, x_mm: float, y_mm: float, height_mm: float, text: str) -> None:
-    """Upright text, though y runs down."""
+    """Draw upright text, though y runs down."""
     canvas.saveState()
     canvas.translate(x_mm, y_mm)
     canvas.scale(1.0, -1.0)

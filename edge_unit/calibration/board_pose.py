@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera's pose by the calibration board: pictures in, pose out, or one sentence that says what to do.
+"""The camera's pose from images of the calibration board, or one sentence that says what to do.
 
-Each picture gives a pose (IPPE, then Levenberg-Marquardt); both solutions that a flat board has are refined, and the
-better one counts if it is better by enough. Many pictures give a mean. Its uncertainty has two parts: what differs
-from picture to picture averages out; what all share (the edges fall on the same pixels while nothing moves) does not,
-and is told by how far the points lie from where the pose has them. What a wrongly measured board or wrong intrinsics
-add, no picture of it shows.
+Each image gives a pose (IPPE, then Levenberg-Marquardt). Both solutions for a flat board are refined, and the better
+one counts if it is better by enough. Many images give a mean. Its uncertainty has two parts. Noise that differs from
+image to image averages out. An error that all images share (the edges fall on the same pixels while nothing moves) does
+not; it is estimated from the reprojection error of the points. A wrongly measured board or wrong intrinsics add an
+error that no image of the board can show.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ from shared.errors import BoardError
 from shared.transforms import Transform, angle_rad, from_rotation_translation, identity, inverse
 
 MIN_FRAMES = 5
-"""With a pose. Fewer say nothing of their own spread."""
+"""Images with a pose. Fewer say nothing of their own spread."""
 
 MAX_FRAMES = 120
-"""Kept at a time: eight seconds at 15 fps."""
+"""Images kept at a time: eight seconds at 15 fps."""
 
 MIN_AGREEING_FRAMES = 0.75
 """Share of the frames with a pose that must agree on it; a camera that is pushed meanwhile has two poses."""
 
 MIN_MARKERS = 3
-"""Unless the board has fewer."""
+"""Markers needed, unless the board has fewer."""
 
 MIN_MARKER_PX = 10.0
 """A marker of 7 cells is not read reliably below."""
 
 MAX_TILT_DEG = 70.0
-"""Of the board's normal to the line of sight; beyond, an edge is a third of its length."""
+"""Angle of the board's normal to the line of sight; beyond, an edge is a third of its length."""
 
 MAX_REPROJECTION_PX = 0.8
-"""RMS. A board that is as described gives 0.1 to 0.3."""
+"""RMS. A board that matches its description gives 0.1 to 0.3."""
 
 AMBIGUOUS_RATIO = 1.3
 AMBIGUOUS_DEG = 3.0
-"""Two poses this far apart that fit nearly alike cannot be told from each other."""
+"""Two poses this far apart that fit almost equally well are ambiguous."""
 
 MAX_SPREAD_M = 0.010
 MAX_SPREAD_SIGMA = 5.0
-"""Of single positions: what is beyond this, and beyond so many times what the picture's noise explains, moved."""
+"""Spread of single positions: beyond this, and beyond so many times the image noise, something moved."""
 
 MAX_UNCERTAINTY_M = 0.030
 MAX_UNCERTAINTY_DEG = 1.0
@@ -60,7 +60,7 @@ MAX_UNCERTAINTY_DEG = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """One picture: what was detected and, where it tells one, the pose.
+    """One image: its detection and, if the detection gives one, the pose.
 
     `T_board_image` is None without a pose; `covariance` (6, 6) of its position (board's frame, m) and rotation (image
     frame, rad); `tilt_deg` of the board to the line of sight.
@@ -76,14 +76,14 @@ class Sighting:
 
 @dataclass(frozen=True, eq=False)
 class Localisation:
-    """Where the camera is, and how well that is known.
+    """The camera's pose, with its uncertainty.
 
     Attributes:
         T_world_camera: (4, 4), the depth camera's optical frame.
         uncertainty_mm, uncertainty_deg: standard error of position and rotation, all axes together.
-        reprojection_px: RMS distance from the points to where the pose has them, median of the frames.
-        frames_used, frames_seen: frames in the mean, and all that were looked at.
-        markers, markers_total: median number seen in a frame, and how many the board has.
+        reprojection_px: RMS distance from the points to their positions by the pose, median of the frames.
+        frames_used, frames_seen: frames in the mean, and all frames examined.
+        markers, markers_total: median number seen in a frame, and the board's number.
     """
 
     T_world_camera: Transform
@@ -97,7 +97,7 @@ class Localisation:
 
 
 class BoardLocaliser:
-    """Collects pictures of one still camera until they tell where it is."""
+    """Collects images of one still camera until its pose is known."""
 
     def __init__(
         self,
@@ -107,7 +107,7 @@ class BoardLocaliser:
         T_depth_image: Transform | None = None,
         distortion_model: str = "brown_conrady",
     ) -> None:
-        """Intrinsics and distortion (k1, k2, p1, p2, k3) are those of the picture; it lies to depth by `T_depth_image`.
+        """Intrinsics and distortion (k1, k2, p1, p2, k3) of the image stream, at `T_depth_image` from the depth camera.
 
         Raises:
             CellError: OpenCV has no such board.
@@ -121,7 +121,7 @@ class BoardLocaliser:
         self._markers_total = len(layout.ids)
 
     def add(self, image: NDArray[np.uint8]) -> Sighting:
-        """Look at a picture (H, W) grey or (H, W, 3) RGB, uint8."""
+        """Add an image (H, W) grey or (H, W, 3) RGB, uint8."""
         sighting = _sighting(self._detector.detect(image), self._intrinsics)
         self._sightings.append(sighting)
         del self._sightings[:-MAX_FRAMES]
@@ -129,7 +129,7 @@ class BoardLocaliser:
 
     @property
     def frames_with_pose(self) -> int:
-        """Pictures so far that tell a pose."""
+        """Number of images so far that give a pose."""
         return len(self._posed)
 
     @property
@@ -142,20 +142,20 @@ class BoardLocaliser:
         ]
 
     def clear(self) -> None:
-        """Forget all pictures."""
+        """Remove all images."""
         self._sightings.clear()
 
     @property
     def now(self) -> str:
-        """What the last picture shows, in a few words."""
+        """Describe the last image in a few words."""
         markers = self._sightings[-1].detection.markers if self._sightings else 0
         return f"{markers} of {self._markers_total} markers"
 
     def result(self) -> Localisation:
-        """The pose by all pictures.
+        """Return the pose from all images.
 
         Raises:
-            BoardError: they do not tell it; one sentence that says why, and what to do.
+            BoardError: they do not give it; one sentence with the reason and the remedy.
         """
         seen = self._sightings
         posed = self._posed
@@ -186,11 +186,11 @@ class BoardLocaliser:
         )
 
     def _check_sight(self, posed: list[Sighting]) -> None:
-        """Is the board seen well enough?"""
+        """Raise BoardError if the board is not seen well enough."""
         total, seen = self._markers_total, self._sightings
         if not any(sighting.detection.markers for sighting in seen):
             raise BoardError(
-                f"none of the board's {total} markers was seen in {len(seen)} pictures: bring the printed board of "
+                f"none of the board's {total} markers was seen in {len(seen)} images: bring the printed board of "
                 "this cell into view, lit and unhidden"
             )
         detections = [sighting.detection for sighting in seen if sighting.detection.markers]
@@ -208,8 +208,8 @@ class BoardLocaliser:
         markers = int(np.median([sighting.detection.markers for sighting in seen]))
         if len(posed) < MIN_FRAMES:
             raise BoardError(
-                f"{markers} of {total} markers were seen, and a pose in {len(posed)} of {len(seen)} pictures, expected "
-                f"{min(MIN_MARKERS, total)} markers in {MIN_FRAMES} pictures: take away what hides the board, light it"
+                f"{markers} of {total} markers were seen, and a pose in {len(posed)} of {len(seen)} images, expected "
+                f"{min(MIN_MARKERS, total)} markers in {MIN_FRAMES} images: take away what hides the board, light it"
             )
         reprojection_px = float(np.median([sighting.reprojection_px for sighting in posed]))
         if reprojection_px > MAX_REPROJECTION_PX:
@@ -225,28 +225,28 @@ class BoardLocaliser:
             )
         if 2 * sum(sighting.ambiguous for sighting in posed) > len(posed):
             raise BoardError(
-                "two poses fit the pictures alike: bring the board nearer, or turn it by 20 to 40 degrees from "
+                "two poses fit the images alike: bring the board nearer, or turn it by 20 to 40 degrees from "
                 "straight on"
             )
 
 
 def _check_agreement(mean: PoseMean, common: NDArray[np.float64], posed: int) -> None:
-    """Did anything move?"""
+    """Raise BoardError if the camera or the board moved."""
     used = int(mean.used.sum())
     expected_m = float(np.sqrt(np.trace(common[:3, :3])))
     if used < MIN_AGREEING_FRAMES * posed:
         raise BoardError(
-            f"only {used} of {posed} pictures agree on a pose: see that neither camera nor board moves, and try again"
+            f"only {used} of {posed} images agree on a pose: see that neither camera nor board moves, and try again"
         )
     if mean.spread_m > max(MAX_SPREAD_M, MAX_SPREAD_SIGMA * expected_m):
         raise BoardError(
-            f"the pose varies by {1e3 * mean.spread_m:.0f} mm from picture to picture: see that neither camera nor "
+            f"the pose varies by {1e3 * mean.spread_m:.0f} mm from image to image: see that neither camera nor "
             "board moves, and try again"
         )
 
 
 def _sighting(detection: Detection, camera: Intrinsics) -> Sighting:
-    """The pose that a detection tells, if any."""
+    """Return a detection with its pose, if it gives one."""
     if not detection.fits:
         return Sighting(detection)
     matrix = np.array(((camera.fx, 0.0, camera.cx), (0.0, camera.fy, camera.cy), (0.0, 0.0, 1.0)))
@@ -258,7 +258,7 @@ def _sighting(detection: Detection, camera: Intrinsics) -> Sighting:
             for rotation, translation in zip(rotations, translations, strict=True)
         ]
     except cv2.error:
-        # Points on one line, or so near to it that there is no homography.
+        # Points on one line, or so close to one line that there is no homography.
         return Sighting(detection)
     fits = []
     for rotation, translation in solutions:
@@ -268,7 +268,7 @@ def _sighting(detection: Detection, camera: Intrinsics) -> Sighting:
             continue
         residuals = camera.project(in_camera_m) - pixels
         fits.append((float(np.sqrt((residuals**2).sum(axis=1).mean())), T_image_board, in_camera_m))
-    # Printed side away: a mirror image, for the board is printed on one side.
+    # The back of the board: a mirror image, as the board is printed on one side.
     fits = [fit for fit in sorted(fits, key=lambda fit: fit[0]) if _facing(fit[1], fit[2]) > 0.0]
     if not fits:
         return Sighting(detection)
@@ -284,7 +284,7 @@ def _sighting(detection: Detection, camera: Intrinsics) -> Sighting:
 
 
 def _facing(T_image_board: Transform, in_camera_m: NDArray[np.float64]) -> float:
-    """Cosine between the board's normal, into it, and the line of sight to the middle of its points."""
+    """Return the cosine between the board's normal, into it, and the line of sight to the middle of its points."""
     sight_m = in_camera_m.mean(axis=0)
     return float(T_image_board[:3, 2] @ sight_m / np.linalg.norm(sight_m))
 
@@ -292,7 +292,7 @@ def _facing(T_image_board: Transform, in_camera_m: NDArray[np.float64]) -> float
 def _covariance(
     camera: Intrinsics, T_image_board: Transform, in_camera_m: NDArray[np.float64], error_px: float
 ) -> NDArray[np.float64]:
-    """(6, 6) of the camera's position in the board's frame and of its rotation in its own, by how the points lie."""
+    """Return (6, 6) of the camera's position in the board's frame and its rotation in its own, from the geometry."""
     x, y, z = in_camera_m.T
     zero = np.zeros_like(z)
     by_point = np.stack(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looks for the board through a source's own pictures: once when asked, or for ever, ever less often."""
+"""Searches for the board in a source's own images: once on command, or repeatedly with growing pauses."""
 
 from __future__ import annotations
 
@@ -8,35 +8,35 @@ from collections.abc import Callable
 from contextlib import aclosing
 
 from edge_unit.calibration.board_pose import BoardLocaliser, Localisation
-from edge_unit.sources.image import ImageStream, LooksAtBoard
+from edge_unit.sources.image import ImageSource, ImageStream
 from shared.cell import Board
 from shared.clock import NS_PER_S
 from shared.errors import BoardError, SourceError
 from shared.waiting import LOOP_CLOCK, Clock
 
 FRAMES = 20
-"""Of which most show the board: a mean of these is as good as one of more, for what they share does not average out."""
+"""Images of which most show the board: more would not help the mean, as their common error does not average out."""
 
 GOOD_FRAMES = 8
 GOOD_MM, GOOD_DEG = 5.0, 0.1
-"""So many that agree on a pose known this well are enough: no margin of the filter is that narrow."""
+"""So many images that agree on a pose known this well are enough: no margin of the filter is that narrow."""
 
 EMPTY_FRAMES = 15
-"""With no marker at all in so many pictures there is no board; one may be hidden by somebody who passes."""
+"""Images without any marker after which there is no board; in one image a person may hide it."""
 
 MAX_LOOK_S = 20.0
-"""For pictures that show some of it; then what there is must do."""
+"""Time for images that show only some of it; then the pose is computed from these."""
 
 RETRY_MIN_S = 2.0
 RETRY_MAX_S = 30.0
-"""Between looks: whoever mounts a board waits no longer, and depth is interrupted no more often."""
+"""Pauses between two searches: a mounted board is found within them, and depth is interrupted no more often."""
 
 
 class BoardSearch:
     """One unit's search for its cell's board."""
 
     def __init__(self, source: object, stream: ImageStream, clock: Clock = LOOP_CLOCK) -> None:
-        """Take a source; one that does not `LooksAtBoard` has no images to look at."""
+        """Without an `ImageSource` as `source` there are no images to search."""
         self._clock = clock
         self._source = source
         self._stream: ImageStream = stream
@@ -46,38 +46,38 @@ class BoardSearch:
 
     @property
     def possible(self) -> bool:
-        """Whether the source has pictures of the board at all."""
-        return isinstance(self._source, LooksAtBoard)
+        """True if the source has images at all."""
+        return isinstance(self._source, ImageSource)
 
     @property
     def due(self) -> bool:
-        """True when it is time to look again, after what was found before."""
+        """True if it is time for another search."""
         return self.possible and self._clock.now_ns() >= self._next_ns
 
     def begin_anew(self) -> None:
-        """Look at once, and often again."""
+        """Search at once, and with short pauses again."""
         self._next_ns, self._retry_s = 0, RETRY_MIN_S
 
-    async def look(self, board: Board, tell: Callable[[str], None]) -> Localisation:
-        """Look at pictures until they tell the pose or are not going to; `tell` is told what is seen meanwhile.
+    async def scan(self, board: Board, tell: Callable[[str], None]) -> Localisation:
+        """Take images until they give the pose, or will not; `tell` receives the progress meanwhile.
 
         Raises:
-            BoardError: they do not tell it; one sentence that says what to do.
+            BoardError: the images do not give a pose; one sentence with the remedy.
             CellError: OpenCV has no such board.
-            SourceError: the camera delivers no pictures.
+            SourceError: the camera delivers no images.
         """
         source = self._source
-        if not isinstance(source, LooksAtBoard):
-            raise BoardError("this unit's source has no pictures in which to look for the board")
+        if not isinstance(source, ImageSource):
+            raise BoardError("this unit's source has no images in which to look for the board")
         begun_ns = self._clock.now_ns()
         try:
-            async with source.look(self._stream) as look:
-                info = look.info
+            async with source.open_images(self._stream) as feed:
+                info = feed.info
                 localiser = BoardLocaliser(
                     board, info.intrinsics, info.distortion, info.T_depth_image, info.distortion_model
                 )
                 seen, empty = 0, 0
-                async with aclosing(look.images()) as images:
+                async with aclosing(feed.images()) as images:
                     async for image in images:
                         sighting = await asyncio.to_thread(localiser.add, image.pixels.copy())
                         tell(f"looking for the board: {localiser.now}")
@@ -89,7 +89,7 @@ class BoardSearch:
                         if await asyncio.to_thread(_is_good, localiser):
                             break
                 if not seen:
-                    raise SourceError("the camera delivered no picture to look for the board in")
+                    raise SourceError("the camera delivered no image to look for the board in")
                 found = await asyncio.to_thread(localiser.result)
         except (BoardError, SourceError) as error:
             self.outcome = str(error)
@@ -102,7 +102,7 @@ class BoardSearch:
 
 
 def _is_good(localiser: BoardLocaliser) -> bool:
-    """Whether the pose is known so well that more pictures are not worth the time."""
+    """Return True if the pose is known so well that more images are not worth the time."""
     if localiser.frames_with_pose < GOOD_FRAMES:
         return False
     try:

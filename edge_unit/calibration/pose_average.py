@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mean of many measurements of one pose, without those that lie far off, and how far it may be off itself."""
+"""The mean of many measurements of one pose, without outliers, and its uncertainty."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from shared.errors import InputError
 from shared.transforms import Transform, from_rotation_translation
 
 OUTLIER = 4.0
-"""Robust standard deviations beyond which a measurement counts for nothing."""
+"""Robust standard deviations beyond which a measurement is left out."""
 
 MAD_TO_SIGMA = 1.4826
-"""Of a normal distribution."""
+"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
 
 FLOOR_M = 2e-4
 FLOOR_RAD = 1e-4
-"""Measurements this near to each other are the same; repeated frames have no spread at all."""
+"""Measurements this close to each other are equal; repeated frames have no spread at all."""
 
 ITERATIONS = 10
 CONVERGED = 1e-10
@@ -32,9 +32,9 @@ class PoseMean:
 
     Attributes:
         pose: (4, 4).
-        used: (N,) which measurements it is the mean of.
-        spread: (6, 6) covariance of one of these: position (m) in the reference frame, then rotation (rad) in the
-            moving one.
+        used: (N,) the measurements in the mean.
+            spread: (6, 6) covariance of a single measurement: position (m) in the reference frame, then rotation
+                    (rad) in the moving one.
     """
 
     pose: Transform
@@ -48,15 +48,15 @@ class PoseMean:
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """(6, 6) of the mean, as far as the measurements are independent."""
+        """Covariance (6, 6) of the mean, if the measurements are independent."""
         return self.spread / max(int(self.used.sum()), 1)
 
 
 def mean_pose(poses: NDArray[np.float64]) -> PoseMean:
-    """The mean of `poses` (N, 4, 4): arithmetic of positions, Karcher's of rotations.
+    """Return the mean of `poses` (N, 4, 4): arithmetic of positions, Karcher's of rotations.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no pose.
     """
     if not len(poses):
         raise InputError("poses: expected at least one, got none")
@@ -76,18 +76,18 @@ def mean_pose(poses: NDArray[np.float64]) -> PoseMean:
 
 
 def differences(pose: Transform, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 6) from `pose` to each of `poses` (N, 4, 4): position, then rotation vector in the frame of `pose`."""
+    """Return (N, 6) from `pose` to each of `poses` (N, 4, 4): position, then rotation vector in the frame of `pose`."""
     shifts = poses[:, :3, 3] - pose[:3, 3]
     turns = [cv2.Rodrigues(pose[:3, :3].T @ other[:3, :3])[0].ravel() for other in poses]
     return np.column_stack((shifts, np.array(turns)))
 
 
 def _most_central(poses: NDArray[np.float64]) -> int:
-    """The measurement that most others are near to."""
+    """Return the measurement that is closest to most others."""
     shifts = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2)
     cosines = 0.5 * (np.einsum("aij,bij->ab", poses[:, :3, :3], poses[:, :3, :3]) - 1.0)
     turns = np.arccos(np.clip(cosines, -1.0, 1.0))
-    # A metre counts as a radian: that is how far apart the two show what is a metre away.
+    # A metre counts as a radian: at a distance of 1 m both move the image by the same amount.
     return int(np.argmin(np.median(shifts + turns, axis=1)))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The learned background on disk, and whether it still fits the camera."""
+"""The background model on disk, with the camera, profile and pose that it belongs to."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_unit.pipeline import Reference
+from edge_unit.pipeline import BackgroundModel
 from edge_unit.sources.frame import CameraInfo
 from shared.errors import InputError
 from shared.files import StateFile
@@ -20,18 +20,18 @@ from shared.transforms import Transform
 logger = logging.getLogger(__name__)
 
 SAME_POSE = 1e-6
-"""Poses travel as text and binary; beyond this (m, and parts of a rotation) the camera is elsewhere."""
+"""Poses travel as text and as binary; beyond this (m, and entries of a rotation) the camera was moved."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """What a background belongs to: one camera, in one profile, at one place."""
+    """The key of a background model: one camera, in one profile, at one pose."""
 
     camera: CameraInfo
     T_world_camera: Transform
 
     def label(self) -> dict[str, Any]:
-        """As plain numbers and text."""
+        """Return the key as plain numbers and text."""
         return {
             "serial": self.camera.serial,
             "intrinsics": self.camera.intrinsics.model_dump(mode="json"),
@@ -39,7 +39,7 @@ class Place:
         }
 
     def fits(self, label: Any) -> bool:
-        """Whether a label was that of this place."""
+        """Return True if a label was made for this place."""
         mine = self.label()
         try:
             pose = np.asarray(label["T_world_camera"], dtype=np.float64)
@@ -53,31 +53,31 @@ class Place:
 
 
 class BackgroundStore:
-    """One folder with one background: images as npz, and a label that tells whose they are."""
+    """One folder with one background model: images as npz, and a label with their place and digest."""
 
     def __init__(self, folder: Path) -> None:
         self._images = folder / "background.npz"
         self._label = StateFile(folder / "background.json")
 
-    def load(self, place: Place) -> Reference | None:
-        """The background of this place, or None when there is none, or another's, or a damaged one."""
+    def load(self, place: Place) -> BackgroundModel | None:
+        """Return the background model of this place; None if there is none, or it is damaged or of another place."""
         label = self._label.load(dict)
         if label is None:
             return None
         if not place.fits(label):
-            logger.info("the background in %s is that of another camera, profile or pose", self._images)
+            logger.info("the background in %s belongs to another camera, profile or pose: not used", self._images)
             return None
         try:
             if _sha256(self._images) != label.get("sha256"):
-                logger.warning("the background in %s is damaged", self._images)
+                logger.warning("the background in %s is damaged: not used, learn it anew", self._images)
                 return None
-            return Reference.load(self._images)
+            return BackgroundModel.load(self._images)
         except (OSError, InputError) as error:
             logger.warning("the background cannot be used: %s", error)
             return None
 
-    def save(self, place: Place, reference: Reference) -> None:
-        """Keep a background; the label is written last and names the images, so that half of it counts for nothing."""
+    def save(self, place: Place, reference: BackgroundModel) -> None:
+        """Store a background model; the label, written last, holds the images' digest: half a write is void."""
         try:
             self._images.parent.mkdir(parents=True, exist_ok=True)
             reference.save(self._images)
@@ -88,7 +88,7 @@ class BackgroundStore:
             self._label.save(label)
 
     def drop(self) -> None:
-        """Forget it.
+        """Remove it from disk.
 
         Raises:
             OSError: it cannot be removed.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera's pose by the board, found through the source's own pictures and told to the master."""
+"""The camera's pose from the board: found in the source's own images, and reported to the master."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ logger = logging.getLogger(__name__)
 
 
 async def localise(search: BoardSearch, uplink: Uplink, assignment: Assignment, frame: DepthFrame) -> Outcome:
-    """Look for the board while depth pauses, and tell the master the pose; returns what came of it.
+    """Search for the board while depth is paused, and report the pose to the master; returns the outcome.
 
-    `frame` is the last one before the look: what is seen meanwhile is told as its trouble.
+    `frame` is the last one before the search; the progress of the search is reported as its trouble.
     """
 
     def tell(seen: str) -> None:
@@ -28,7 +28,7 @@ async def localise(search: BoardSearch, uplink: Uplink, assignment: Assignment, 
 
     first = not search.outcome
     try:
-        found = await search.look(require_board(assignment.cell.board), tell)
+        found = await search.scan(require_board(assignment.cell.board), tell)
         quality = PoseQuality(
             uncertainty_mm=round(found.uncertainty_mm, 3),
             uncertainty_deg=round(found.uncertainty_deg, 4),
@@ -36,12 +36,12 @@ async def localise(search: BoardSearch, uplink: Uplink, assignment: Assignment, 
         )
         await uplink.tell_pose(found.T_world_camera, "board", quality)
     except CellwatchError as error:
-        # It looks for ever, but says so once.
+        # It retries without end, but warns once.
         logger.log(logging.WARNING if first else logging.DEBUG, "%s", error)
         tell(f"looking for the board: {error}")
         return Outcome("failed", str(error))
     logger.info(
-        "found the board in %d of %d pictures: the pose is known to %.1f mm and %.2f degrees",
+        "found the board in %d of %d images: the pose is known to %.1f mm and %.2f degrees",
         found.frames_used,
         found.frames_seen,
         found.uncertainty_mm,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the master asked for, by when it is carried out."""
+"""Commands of the master, sorted by the time of their execution."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from shared.messages import Command
 
 
 @dataclass(frozen=True)
-class Orders:
-    """Commands: in place of a frame, before it is filtered, or afterwards with what it showed."""
+class CommandBatch:
+    """Commands that replace a frame, that run before it is filtered, or that need its result."""
 
     calibrations: list[Command] = field(default_factory=list)
     changes: list[Command] = field(default_factory=list)
     pictures: list[Command] = field(default_factory=list)
 
     @classmethod
-    def take(cls, queue: asyncio.Queue[Command]) -> Orders:
-        """All that wait."""
-        orders = cls()
+    def take(cls, queue: asyncio.Queue[Command]) -> CommandBatch:
+        """Take all waiting commands."""
+        batch = cls()
         while not queue.empty():
             command = queue.get_nowait()
-            orders._kind(command).append(command)
-        return orders
+            batch._kind(command).append(command)
+        return batch
 
     def _kind(self, command: Command) -> list[Command]:
         if command.verb == "calibrate":
@@ -34,6 +34,6 @@ class Orders:
 
 
 def put_back(queue: asyncio.Queue[Command], commands: Iterable[Command]) -> None:
-    """Have `commands` wait for the next frame."""
+    """Put `commands` back, for the next frame."""
     for command in commands:
         queue.put_nowait(command)

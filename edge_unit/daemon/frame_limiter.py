@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames beyond `fps_max` are passed over."""
+"""A rate limiter: drops frames beyond `fps_max`."""
 
 from __future__ import annotations
 
 from shared.clock import NS_PER_S
 
 EARLY_SHARE = 0.9
-"""Of the period after which the next frame is due: a camera's own jitter must not cost every second frame."""
+"""Part of the period after which the next frame is due: the camera's own jitter must not cost every second frame."""
 
 
 class FrameLimiter:
-    """Lets at most `fps_max` frames a second through; all of them where it is None."""
+    """Passes at most `fps_max` frames a second; all of them if it is None."""
 
     def __init__(self, fps_max: float | None) -> None:
         self._period_ns = None if fps_max is None else round(EARLY_SHARE * NS_PER_S / fps_max)
         self._next_at_ns = 0
 
     def due(self, captured_at_ns: int) -> bool:
-        """Return True if the frame of this time is to be processed; then the next is due a period later."""
+        """Return True if the frame of this time is to be processed; the next one is due a period later."""
         if self._period_ns is None:
             return True
         if captured_at_ns < self._next_at_ns:

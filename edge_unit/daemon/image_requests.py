@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures that people ask for: drawn between two frames, encoded and sent beside them."""
+"""The images that the master requests: drawn between two frames, encoded and sent in the background."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from edge_unit.daemon.joint_lookup import known
 from edge_unit.daemon.pipeline_manager import AssignedPipeline
-from edge_unit.daemon.task_group import Errands
+from edge_unit.daemon.task_group import TaskGroup
 from edge_unit.joints import JointEstimate
 from edge_unit.pipeline import picture_raw, png_of
 from edge_unit.sources.frame import DepthFrame
@@ -22,16 +22,16 @@ from shared.messages import Command, ImageKind, Outcome
 NO_POSE = "the pose of its camera is not known yet"
 
 
-class Showing:
-    """One unit's pictures."""
+class ImageRequests:
+    """Image requests of one unit."""
 
-    def __init__(self, uplink: Uplink, assigned: AssignedPipeline, errands: Errands) -> None:
+    def __init__(self, uplink: Uplink, assigned: AssignedPipeline, tasks: TaskGroup) -> None:
         self._uplink = uplink
         self._assigned = assigned
-        self._errands = errands
+        self._errands = tasks
 
     async def show(self, commands: Iterable[Command], frame: DepthFrame, joints: JointEstimate | None) -> None:
-        """Draw what `commands` ask for of the frame that was processed last."""
+        """Draw the images that `commands` request, from the frame that was processed last."""
         for command in commands:
             if command.image is None:
                 continue

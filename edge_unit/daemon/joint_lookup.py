@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the robot was when a frame was taken, by the master's clock, and whether the joints' times are right."""
+"""The joints at a frame's capture time, by the master's clock, and a check of the joints' delay."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edge_unit.joints import DelayWatch, JointEstimate
+from edge_unit.joints import DelayMonitor, JointEstimate
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.pipeline.moving_model import EXACT
 from edge_unit.sources.frame import DepthFrame
@@ -22,10 +22,10 @@ class FrameJoints:
 
     def __init__(self, uplink: Uplink) -> None:
         self._uplink = uplink
-        self._delay = DelayWatch()
+        self._delay = DelayMonitor()
 
     async def at(self, assignment: Assignment, frame: DepthFrame) -> JointEstimate | None:
-        """Where the robot was when the frame was taken; None when nobody knows."""
+        """Return the joints at the frame's capture time; None if they are not known."""
         robot = assignment.cell.robot
         if robot is None:
             return None
@@ -40,25 +40,24 @@ class FrameJoints:
         return self._uplink.joints.at(at_ns, uncertainty_ns, assignment.settings.robot_stale_after_s)
 
     def watch_delay(self, pipeline: DepthPipeline, frame: DepthFrame) -> Callable[[], None] | None:
-        """Return what looks whether the joints are later than the settings say, for a thread beside the frames.
+        """Return a check of the joints' delay, to run in a thread in the background; mostly None: no check is due.
 
-        Mostly there is nothing to look at: None. The frame is copied where it is wanted later. Not while another thread
-        works with the pipeline.
+        Copies the frame if a later check needs it. Do not call it while another thread works with the pipeline.
         """
         clock = self._uplink.clock
         if frame.joints is not None or not clock.known:
             return None
         at_ns = frame.captured_at_ns + clock.offset_ns
-        look = self._delay.next_look(self._uplink.joints)
+        comparison = self._delay.next_comparison(self._uplink.joints)
         if self._delay.due(at_ns):
             self._delay.keep(pipeline, frame.depth, at_ns)
-        return look
+        return comparison
 
     def warning(self, joint_delay_s: float) -> str | None:
-        """What to set instead, where `joint_delay_s` is clearly off."""
+        """Return the value to set instead of `joint_delay_s` if that is clearly wrong, else None."""
         return self._delay.warning(joint_delay_s)
 
 
 def known(joints: JointEstimate | None) -> tuple[NDArray[np.float64] | None, ArrayLike]:
-    """Positions (n,) and their uncertainty, as the pipeline takes them; None where nobody knows."""
+    """Return positions (n,) and their uncertainty for the pipeline; None if they are not known."""
     return (None, EXACT) if joints is None else (joints.positions, joints.uncertainty)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera's pose refined while a unit runs: frames are gathered, and the pose that they tell goes to the master."""
+"""Refinement of the camera's pose while a unit runs: gathers frames, refines, reports the pose to the master."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from edge_unit.daemon.background_learning import POSE_CHANGED
 from edge_unit.daemon.pipeline_manager import AssignedPipeline
 from edge_unit.joints import JointEstimate
-from edge_unit.monitoring import Stance
+from edge_unit.monitoring import PoseMonitor
 from edge_unit.pipeline import DepthPipeline, Refiner
 from edge_unit.uplink.uplink import Uplink
 from shared.errors import CellwatchError
@@ -22,53 +22,53 @@ from shared.messages import Command, Outcome, PoseQuality
 logger = logging.getLogger(__name__)
 
 REFINE_FRAMES = 30
-"""Frames whose median a pose is refined by: two seconds at 15 fps, in which people pass by."""
+"""A pose is refined by the median of so many frames: two seconds at 15 fps, in which people pass by."""
 
 
 @dataclass(frozen=True, eq=False)
-class Gathered:
-    """Frames for the pose to be refined by."""
+class RefinementFrames:
+    """Frames of one refinement."""
 
     command: Command
     frames: list[NDArray[np.uint16]]
     refiner: Refiner
 
 
-class Refining:
-    """One unit's refinements, one at a time."""
+class RefinementTask:
+    """Refinements of one unit's pose, one at a time."""
 
-    def __init__(self, uplink: Uplink, assigned: AssignedPipeline, stance: Stance) -> None:
+    def __init__(self, uplink: Uplink, assigned: AssignedPipeline, monitor: PoseMonitor) -> None:
         self._uplink = uplink
         self._assigned = assigned
-        self._stance = stance
-        self._gathered: Gathered | None = None
+        self._monitor = monitor
+        self._gathered: RefinementFrames | None = None
 
     def begin(self, pipeline: DepthPipeline, command: Command) -> None:
-        """Gather frames from now on, as `command` asks."""
+        """Start to gather frames on `command`."""
         if self._gathered is not None:
-            self._uplink.finish(self._gathered.command, Outcome("superseded", "it was asked to begin anew"))
-        self._gathered = Gathered(command, [], pipeline.refiner())
+            self._uplink.finish(self._gathered.command, Outcome("superseded", "a newer command started it anew"))
+        self._gathered = RefinementFrames(command, [], pipeline.refiner())
 
     def gather(self, pipeline: DepthPipeline, depth: NDArray[np.uint16], joints: JointEstimate | None) -> None:
-        """Keep a frame (H, W) without the robot, when the pose is to be refined."""
+        """Keep a frame (H, W) without the robot's pixels, if a refinement needs frames."""
         gathered = self._gathered
         if gathered is None or len(gathered.frames) == REFINE_FRAMES:
             return
         if joints is None and pipeline.cell.robot is not None:
-            # Wherever it may stand: it must not be taken for CAD.
+            # Without joints its position is not known, and it must not be taken for CAD.
             return
         gathered.frames.append(pipeline.without_robot(depth, None if joints is None else joints.positions))
 
-    def take(self) -> Gathered | None:
-        """The frames, once there are enough: then they are no longer kept."""
+    def take(self) -> RefinementFrames | None:
+        """Return the frames once there are enough, and stop gathering; else None."""
         gathered = self._gathered
         if gathered is None or len(gathered.frames) < REFINE_FRAMES:
             return None
         self._gathered = None
         return gathered
 
-    async def refine(self, gathered: Gathered) -> None:
-        """Refine the pose by the frames gathered, while others are processed, and tell the master."""
+    async def refine(self, gathered: RefinementFrames) -> None:
+        """Refine the pose by the gathered frames in the background, and report it to the master."""
         try:
             found = await asyncio.to_thread(gathered.refiner.refine, gathered.frames)
             pipeline = self._assigned.pipeline
@@ -76,8 +76,8 @@ class Refining:
                 self._uplink.finish(gathered.command, Outcome("superseded", POSE_CHANGED))
                 return
             if found.accepted:
-                # Of a camera that moved, what was learned shows another place.
-                self._assigned.refined = None if self._stance.verdict.moved else found.T_world_camera
+                # If the camera was moved, its background model shows another place.
+                self._assigned.refined = None if self._monitor.verdict.moved else found.T_world_camera
                 await self._uplink.tell_pose(found.T_world_camera, "refined", PoseQuality())
         except CellwatchError as error:
             self._uplink.finish(gathered.command, Outcome("failed", str(error)))

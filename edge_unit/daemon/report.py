@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame as a report: what it shows, what it looks through, and whether its camera can be trusted."""
+"""A frame's report: obstacle voxels, seen blocks, and the health of the camera."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shared.transforms import Transform
 
 
 def within_bounds(result: FrameResult, T_world_camera: Transform) -> tuple[Voxels, SeenBlocks, str | None]:
-    """Return a frame's voxels and seen blocks, and a warning where not all can be reported."""
+    """Return a frame's voxels and seen blocks, and a warning if the limits leave some out."""
     voxels, seen = result.voxels, result.seen
     if len(voxels) <= MAX_VOXELS:
         return voxels, seen, None
@@ -33,8 +33,8 @@ def parts_of(times: StageTimes) -> dict[str, int]:
     }
 
 
-def health_of(result: FrameResult, frame: DepthFrame, stance: Verdict, warning: str | None) -> Health:
-    """Tell whether the camera can be trusted, by what a frame told."""
+def health_of(result: FrameResult, frame: DepthFrame, verdict: Verdict, warning: str | None) -> Health:
+    """Return the health of the camera after a frame."""
     fit = result.health
     return Health(
         valid_share=fit.valid_share,
@@ -43,14 +43,14 @@ def health_of(result: FrameResult, frame: DepthFrame, stance: Verdict, warning: 
         static_share=fit.static_share,
         process_ms=round(result.times.total_ns / NS_PER_MS, 3),
         frame=frame.frame_number,
-        moved=stance.moved or None,
-        blind=stance.blind or None,
+        moved=verdict.moved or None,
+        blind=verdict.blind or None,
         warning=warning,
     )
 
 
 def troubled(assignment: Assignment, frame: DepthFrame, trouble: Trouble | None) -> Report:
-    """A report that only says what is wrong: no voxels, nothing seen."""
+    """Return a report without voxels and seen blocks, with the trouble as its reason."""
     health = Health(frame=frame.frame_number)
     if trouble is not None:
         health = health.model_copy(update=trouble.facts())

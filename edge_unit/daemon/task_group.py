@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work that no frame waits for."""
+"""Background tasks, which no frame waits for."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from collections.abc import Coroutine
 from typing import Any
 
 
-class Errands:
-    """Tasks that end by themselves, or with the unit."""
+class TaskGroup:
+    """Tasks that end by themselves, or are cancelled when the unit ends."""
 
     def __init__(self) -> None:
         self._tasks: set[asyncio.Task[None]] = set()
 
     def start(self, work: Coroutine[Any, Any, None]) -> None:
-        """Do `work` beside all else."""
+        """Run `work` as a task in the background."""
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     async def end(self) -> None:
-        """Cancel what is not done yet."""
+        """Cancel all unfinished tasks."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)

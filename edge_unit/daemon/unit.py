@@ -15,21 +15,21 @@ from contextlib import aclosing, suppress
 
 from edge_unit.calibration.board_scan import BoardSearch
 from edge_unit.config import UnitConfig
-from edge_unit.daemon.background_learning import Learning
+from edge_unit.daemon.background_learning import BackgroundLearning
 from edge_unit.daemon.background_store import BackgroundStore
 from edge_unit.daemon.calibration_task import localise
-from edge_unit.daemon.command_batch import Orders, put_back
+from edge_unit.daemon.command_batch import CommandBatch, put_back
 from edge_unit.daemon.frame_limiter import FrameLimiter
-from edge_unit.daemon.frame_processor import FrameWork
-from edge_unit.daemon.image_requests import NO_POSE, Showing
+from edge_unit.daemon.frame_processor import FrameProcessor
+from edge_unit.daemon.image_requests import NO_POSE, ImageRequests
 from edge_unit.daemon.joint_lookup import FrameJoints
 from edge_unit.daemon.pipeline_manager import AssignedPipeline
-from edge_unit.daemon.refinement_task import Refining
+from edge_unit.daemon.refinement_task import RefinementTask
 from edge_unit.daemon.report import troubled
-from edge_unit.daemon.task_group import Errands
+from edge_unit.daemon.task_group import TaskGroup
 from edge_unit.daemon.unit_status import UnitStatus
-from edge_unit.daemon.warm_up import rehearse
-from edge_unit.monitoring import CameraStanding, Progress, Stages, Stance, Trace, boot_id
+from edge_unit.daemon.warm_up import warm_up_kernels
+from edge_unit.monitoring import CameraStatus, PoseMonitor, StageTimer, StallDetector, Trace, boot_id
 from edge_unit.source_factory import is_recording
 from edge_unit.sources.frame import DepthFrame, DepthSource
 from edge_unit.sources.status import ReportsStatus
@@ -97,24 +97,24 @@ class Unit:
             masters,
             clock,
         )
-        self._camera = CameraStanding(config, self.uplink)
+        self._camera = CameraStatus(config, self.uplink)
         self._trace = None if config.trace_path is None else Trace(config.trace_path)
         self._search = BoardSearch(source, config.board_stream, clock)
         self._work = self._frame_work()
-        self._errands = Errands()
-        self._showing = Showing(self.uplink, self._work.assigned, self._errands)
-        self._progress = Progress(clock)
+        self._errands = TaskGroup()
+        self._showing = ImageRequests(self.uplink, self._work.assigned, self._errands)
+        self._progress = StallDetector(clock)
         self._rehearsal: asyncio.Task[None] | None = None
         self._limiter = FrameLimiter(config.fps_max)
         self._status = UnitStatus(clock)
 
-    def _frame_work(self) -> FrameWork:
+    def _frame_work(self) -> FrameProcessor:
         config, finish = self._config, self.uplink.finish
-        stance = Stance(config.state_dir)
-        learning = Learning(BackgroundStore(config.state_dir), config.learn_background_frames, finish)
+        stance = PoseMonitor(config.state_dir)
+        learning = BackgroundLearning(BackgroundStore(config.state_dir), config.learn_background_frames, finish)
         assigned = AssignedPipeline(learning, stance)
-        refining = Refining(self.uplink, assigned, stance)
-        return FrameWork(finish, assigned, learning, refining, stance, FrameJoints(self.uplink))
+        refining = RefinementTask(self.uplink, assigned, stance)
+        return FrameProcessor(finish, assigned, learning, refining, stance, FrameJoints(self.uplink))
 
     async def run(self) -> None:
         """Watch and report.
@@ -199,7 +199,7 @@ class Unit:
 
     def _rehearse(self) -> None:
         with self._progress.working("compiling the kernels", PREPARE_S_MAX):
-            rehearse()
+            warm_up_kernels()
 
     async def _end(self) -> None:
         """A recording has no more frames."""
@@ -218,7 +218,7 @@ class Unit:
         assignment = self.uplink.assignment or self._work.assigned.assignment
         if assignment is None:
             return
-        orders = Orders.take(self.uplink.commands)
+        orders = CommandBatch.take(self.uplink.commands)
         if orders.calibrations:
             put_back(self.uplink.commands, (*orders.changes, *orders.pictures))
             # The frame is of before the look, and its memory may be gone afterwards.
@@ -229,7 +229,7 @@ class Unit:
         else:
             await self._filter(assignment, assignment.T_world_camera, frame, orders)
 
-    async def _look_for_pose(self, assignment: Assignment, frame: DepthFrame, orders: Orders) -> None:
+    async def _look_for_pose(self, assignment: Assignment, frame: DepthFrame, orders: CommandBatch) -> None:
         """Say that nobody knows where the camera stands, and look for the board now and then."""
         self._work.assigned.pipeline = None
         self._finish(orders.changes, Outcome("refused", NO_POSE))
@@ -244,10 +244,10 @@ class Unit:
             await localise(self._search, self.uplink, assignment, frame)
 
     async def _filter(
-        self, assignment: Assignment, T_world_camera: Transform, frame: DepthFrame, orders: Orders
+        self, assignment: Assignment, T_world_camera: Transform, frame: DepthFrame, orders: CommandBatch
     ) -> None:
         """Process the frame and offer the result; nothing that follows delays it."""
-        stages = Stages(frame.captured_at_ns, self._clock)
+        stages = StageTimer(frame.captured_at_ns, self._clock)
         stages.end("source")
         joints = await self._work.joints.at(assignment, frame)
         stages.end("joints")

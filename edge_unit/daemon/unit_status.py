@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a unit fares, in one line for a person: its trouble, or its frames a second."""
+"""The state of a unit in one line for a person: its trouble, or its frames a second."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ logger = logging.getLogger(__name__)
 
 
 class UnitStatus:
-    """The trouble of the last frame, and the frames since the status was asked for last."""
+    """The trouble of the last frame, and the number of frames since the last call of `line`."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -21,14 +21,14 @@ class UnitStatus:
         self._asked = 0, clock.now_ns()
 
     def note_frame(self, trouble: str | None) -> None:
-        """Count a processed frame; the log says when trouble begins or ends."""
+        """Count a processed frame; log the begin and the end of trouble."""
         self._frames += 1
         if (trouble is None) != (self._trouble is None):
             logger.info("%s", trouble or "frames are filtered and reported")
         self._trouble = trouble
 
     def note_trouble(self, trouble: str) -> None:
-        """Take note of why frames are not processed."""
+        """Record the reason for which frames are not processed."""
         self._trouble = trouble
 
     def line(self, camera_trouble: str | None) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every kernel, compiled or read from disk before the first frame; most before anyone knows where the camera stands."""
+"""The warm-up: kernels are compiled or loaded before the first frame, most before the camera's pose is known."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ CAMERA = Intrinsics(64, 48, 60.0, 60.0, 31.5, 23.5)
 DEPTH_MM = 1000
 
 
-def rehearse() -> None:
-    """Run the pipeline once before a cell that has a wall and a robot, whatever the true one has."""
+def warm_up_kernels() -> None:
+    """Run the pipeline once on a cell with a wall and a robot, whatever the true cell has."""
     wall = PlacedMesh("wall", box_mesh("wall", (2.0, 2.0, 0.1)), from_xyz_rpy((0.0, 0.0, 3.0), np.zeros(3)))
     robot = Robot.from_dh(
         [DHJoint("joint")],
@@ -36,10 +36,10 @@ def rehearse() -> None:
 
 
 def warm_up(pipeline: DepthPipeline) -> None:
-    """Have all that `pipeline` needs ready, by a frame that shows nothing."""
+    """Prepare all that `pipeline` needs, with an empty frame."""
     robot = pipeline.cell.robot
     joints = None if robot is None else np.zeros(robot.joint_count)
     pipeline.process(np.zeros(pipeline.intrinsics.shape, np.uint16), joints, with_misfit=True)
-    # What is there now stays; without this, each full collection looks through it, and a frame waits 0.1 s.
+    # Objects made so far live on. Without this each full collection scans them, and a frame waits 0.1 s.
     gc.collect()
     gc.freeze()

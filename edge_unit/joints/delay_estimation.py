@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much later the joints' times are than the frames', found by the motion that happens anyway.
+"""Estimation of the joints' delay against the frames, from motion that happens anyway.
 
-For each delay that may be, the robot is drawn as it would have stood; the delay at which frames fit best, over many
-frames with motion, is the true one. Nothing is moved for it. A camera makes near things wider on all sides alike, so
-that neither pulls: what is too wide ahead of the robot is as much too wide behind it.
+For each possible delay, the robot is drawn at the joints of that delay. The true delay is the one at which many frames
+with motion fit best. The robot need not move for it. A camera makes near things wider on all sides alike, and this does
+not bias the result: the excess ahead of the robot equals the excess behind it.
 """
 
 from __future__ import annotations
@@ -29,36 +29,36 @@ from shared.transforms import Transform, inverse
 Number = TypeVar("Number", np.float32, np.uint16)
 
 DELAYS_S = np.arange(-10, 21) * 0.01
-"""What is tried: times may be too early as well, where a camera's are late."""
+"""The delays that are tried: times may also be too early, if a camera's are late."""
 
 FIT_REACH_S = 0.035
-"""About the best of these a parabola is laid: beyond, the robot has left its own width and the curve is flat."""
+"""A parabola is fitted this far about the best delay: beyond, the robot left its own width and the curve is flat."""
 
 COLUMNS_LOOKED_AT = 212
-"""Of the picture's: the robot's rim is met some thousand times in a look."""
+"""Columns of the image that are used: some thousand pixels lie on the robot's rim in each frame."""
 
 MOTION_SPAN_S = 0.1
 MOTION_MIN_M = 0.02
-"""A frame counts when some point of the robot may move by so much in that time: at 0.2 m/s."""
+"""A frame counts if some point of the robot may move by so much in that time: at 0.2 m/s."""
 
 LOOKS_MIN = 24
-"""With fewer frames of motion nothing is said."""
+"""With fewer frames of motion there is no estimate."""
 
 GROUPS = 8
-"""Of looks; each is left out once, and how much the result then changes tells its uncertainty."""
+"""Groups of frames; each is left out once, and the resulting change gives the estimate's uncertainty."""
 
 
 @dataclass(frozen=True)
 class DelayEstimate:
-    """`delay_s` is what `joint_delay_s` should be, one standard deviation `uncertainty_s`, from so many `looks`."""
+    """`delay_s` is the right `joint_delay_s`, with one standard deviation `uncertainty_s`, from `looks` frames."""
 
     delay_s: float
     uncertainty_s: float
     looks: int
 
 
-class DelayLook:
-    """Compares frames of one camera with the robot as it would have stood at each of `DELAYS_S`."""
+class DelayComparison:
+    """Compares frames of one camera with the robot drawn at each of `DELAYS_S`."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class DelayLook:
         static_depth_m: NDArray[np.float32],
         settings: FilterSettings,
     ) -> None:
-        """`static_depth_m` (H, W) is what stands still, inf where nothing is known: `expected_depth(None)`."""
+        """`static_depth_m` (H, W): depth of the static surfaces, inf where nothing is known: `expected_depth(None)`."""
         self._robot = robot
         self._stride_px = stride_px = max(round(intrinsics.width / COLUMNS_LOOKED_AT), 1)
         self._first_px = stride_px // 2
@@ -88,20 +88,20 @@ class DelayLook:
 
     @cached_property
     def _bare_robot(self) -> BareRobot:
-        # With the first look, in its own thread: all of the links' CAD is prepared.
+        # Made with the first comparison, in its thread: it prepares the CAD of all links.
         return BareRobot(self._small, self._robot)
 
     def thinned(self, depth: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """What `misfits` needs of a frame (H, W): a few thousand depths in metres, a copy."""
+        """Return the input of `misfits` for a frame (H, W): a few thousand depths in metres, a copy."""
         return np.asarray(self._thinned(depth) * np.float32(self._scale_m), np.float32)
 
     def moves(self, before: ArrayLike, after: ArrayLike) -> bool:
-        """Whether the robot moves enough for a look; joints (n,) half of `MOTION_SPAN_S` before and after the frame."""
+        """Return True if the robot moves enough; joints (n,) half of `MOTION_SPAN_S` before and after the frame."""
         turned = np.abs(np.subtract(after, before))
         return float(self._robot.displacement_m(turned, before).max(initial=0.0)) >= MOTION_MIN_M
 
     def misfits(self, thinned_m: NDArray[np.float32], joints: Sequence[ArrayLike]) -> NDArray[np.float64]:
-        """How badly a frame fits, summed over its pixels, for joints (n,) at each of the delays."""
+        """Return the misfit of a frame, summed over its pixels, for joints (n,) at each of the delays."""
         measured = thinned_m > 0.0
         depth_m = thinned_m[measured]
         scale_m = SCALE_BASE_M + self._noise_per_m * depth_m**2
@@ -126,18 +126,18 @@ class DelayLook:
 
 
 def estimate_delay(misfits: Collection[NDArray[np.float64]]) -> DelayEstimate:
-    """The delay by looks of `DelayLook.misfits`.
+    """Estimate the delay from results of `DelayComparison.misfits`.
 
     Raises:
-        InputError: there are too few looks, for the robot hardly moved; or no delay fits better than all others.
+        InputError: there are too few frames, as the robot hardly moved; or no delay fits better than all others.
     """
     if len(misfits) < LOOKS_MIN:
         raise InputError(
             f"joint delay: the robot hardly moved: {len(misfits)} frames with motion of {MOTION_MIN_M / MOTION_SPAN_S} "
             f"m/s and more in view, expected at least {LOOKS_MIN}"
         )
-    looks = np.array(misfits)
-    sums = np.array([looks[group::GROUPS].sum(axis=0) for group in range(GROUPS)])
+    frames = np.array(misfits)
+    sums = np.array([frames[group::GROUPS].sum(axis=0) for group in range(GROUPS)])
     whole = sums.sum(axis=0)
     delay_s = _best(whole)
     without_s = np.array([_best(whole - part) for part in sums])
@@ -146,32 +146,32 @@ def estimate_delay(misfits: Collection[NDArray[np.float64]]) -> DelayEstimate:
 
 
 def _best(curve: NDArray[np.float64]) -> float:
-    """Where a parabola about the least of the misfits (D,) has its lowest point."""
+    """Return the position of the lowest point of a parabola about the least of the misfits (D,)."""
     lowest = float(DELAYS_S[int(np.argmin(curve))])
     near = np.abs(DELAYS_S - lowest) <= FIT_REACH_S
     if np.count_nonzero(near) < round(2.0 * FIT_REACH_S / (DELAYS_S[1] - DELAYS_S[0])):
         raise InputError(
-            f"joint delay: the robot fits best at {1e3 * lowest:.0f} ms, at the rim of what is tried: "
-            "are the times of frames and joints by the same clock?"
+            f"joint delay: the robot fits best at {1e3 * lowest:.0f} ms, at the end of the tried range: "
+            "check that the times of frames and joints are of the same clock"
         )
     square, slope, _ = np.polyfit(DELAYS_S[near] - lowest, curve[near], 2)
     if not square > 0.0:
-        raise InputError("joint delay: no delay fits better than others: does the camera see the robot move?")
+        raise InputError("joint delay: no delay fits better than others: check that the camera sees the robot move")
     return lowest - 0.5 * float(slope / square)
 
 
-def look_at(
-    look: DelayLook,
+def compare_frame(
+    comparison: DelayComparison,
     depth: NDArray[np.uint16],
     captured_s: float,
     joints_at: Callable[[float], NDArray[np.float64] | None],
 ) -> NDArray[np.float64] | None:
-    """The misfits of a frame (H, W) of this time in s, where joints stood by their own times; None of one without use.
+    """Return the misfits of a frame (H, W) of this time in s, for joints by their own times; None if it is useless.
 
-    It is of use when the robot moved, and all of its joints about that time are known.
+    A frame is useful if the robot moved, and all joints about that time are known.
     """
     offsets_s = (-0.5 * MOTION_SPAN_S, 0.5 * MOTION_SPAN_S, *DELAYS_S.tolist())
     joints = [each for offset_s in offsets_s if (each := joints_at(captured_s + offset_s)) is not None]
-    if len(joints) < len(offsets_s) or not look.moves(joints[0], joints[1]):
+    if len(joints) < len(offsets_s) or not comparison.moves(joints[0], joints[1]):
         return None
-    return look.misfits(look.thinned(depth), joints[2:])
+    return comparison.misfits(comparison.thinned(depth), joints[2:])

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How late joints are, by a recording that has the times of both: `edge-unit joint-delay DIR --cell cell.yaml`.
+"""The joints' delay from a recording that has the times of both: `edge-unit joint-delay DIR --cell cell.yaml`.
 
-DIR is a folder as the `recorded` source reads it, with its camera's pose, and beside the images two files more:
-`frame_times_s.csv`, a row a frame, and `joint_samples.csv`, rows of time in s and positions in rad (m if prismatic).
+DIR is a folder as the `recorded` source reads it, with its camera's pose, and two more files beside the images:
+`frame_times_s.csv`, a row for each frame, and `joint_samples.csv`, rows of time in s and positions in rad (m if
+prismatic).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_unit.joints.delay_estimation import DelayEstimate, DelayLook, estimate_delay, look_at
+from edge_unit.joints.delay_estimation import DelayComparison, DelayEstimate, compare_frame, estimate_delay
 from edge_unit.joints.history import EXTRAPOLATION_MAX_S
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
@@ -30,11 +31,11 @@ MAX_FILE_BYTES = 256 * 2**20
 
 
 def delay_of_recording(config: RecordedSourceConfig, cell: Cell) -> DelayEstimate:
-    """The delay of a recording's joints.
+    """Estimate the delay of a recording's joints.
 
     Raises:
         SourceError: a file is missing or malformed; names it.
-        InputError: the cell has no robot, the recording no pose; or as `estimate_delay`.
+        InputError: the cell has no robot or the recording no pose; or as `estimate_delay` raises.
     """
     return asyncio.run(_delay(config, cell))
 
@@ -42,7 +43,7 @@ def delay_of_recording(config: RecordedSourceConfig, cell: Cell) -> DelayEstimat
 async def _delay(config: RecordedSourceConfig, cell: Cell) -> DelayEstimate:
     robot = cell.robot
     if robot is None:
-        raise InputError(f"cell {cell.name}: expected one with a robot")
+        raise InputError(f"cell {cell.name}: expected a cell with a robot, got none: choose another with --cell")
     times_s = _table(config.folder / FRAME_TIMES, 1)[:, 0]
     samples = JointSamples(_table(config.folder / JOINT_SAMPLES, 1 + robot.joint_count), config.folder / JOINT_SAMPLES)
     source = RecordedSource(config)
@@ -51,11 +52,11 @@ async def _delay(config: RecordedSourceConfig, cell: Cell) -> DelayEstimate:
         raise InputError(f"{config.folder / config.pose}: expected the camera's pose, there is no such file")
     settings = FilterSettings()
     static_m = DepthPipeline(info.intrinsics, info.T_world_camera, cell, settings).expected_depth(None)
-    look = DelayLook(info.intrinsics, info.T_world_camera, robot, static_m, settings)
+    comparison = DelayComparison(info.intrinsics, info.T_world_camera, robot, static_m, settings)
     found, count = [], 0
     async for frame in source.frames():
         if count < len(times_s):
-            misfits = look_at(look, frame.depth, float(times_s[count]), samples.at)
+            misfits = compare_frame(comparison, frame.depth, float(times_s[count]), samples.at)
             found += [] if misfits is None else [misfits]
         count += 1
     if count != len(times_s):
@@ -69,13 +70,13 @@ class JointSamples:
     """Samples (N, 1 + n) of time in s and positions, interpolated."""
 
     def __init__(self, samples: NDArray[np.float64], path: Path) -> None:
-        """Raises SourceError when times do not rise; `path` is named."""
+        """Raises SourceError, which names `path`, if times do not rise."""
         if not (np.diff(samples[:, 0]) > 0.0).all():
             raise SourceError(f"{path}: expected rising times")
         self._times_s, self._positions = samples[:, 0], samples[:, 1:]
 
     def at(self, t_s: float) -> NDArray[np.float64] | None:
-        """Positions (n,) at `t_s`; None where no samples near enough in time are known on either side."""
+        """Return positions (n,) at `t_s`; None without samples close in time on both sides."""
         after = int(np.searchsorted(self._times_s, t_s))
         if not 0 < after < len(self._times_s) or np.diff(self._times_s[after - 1 : after + 1]) > EXTRAPOLATION_MAX_S:
             return None
@@ -84,7 +85,7 @@ class JointSamples:
 
 
 def _table(path: Path, columns: int) -> NDArray[np.float64]:
-    """Rows of so many finite numbers."""
+    """Return rows of so many finite numbers."""
     try:
         table = parse_numbers(read_text(path))
     except (OSError, ValueError) as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the camera is doing, told to the master at once: which one is here, which is missing, and why."""
+"""The camera's status, reported to the master at once: the open camera, the missing one, and the reason."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from shared.transforms import Transform
 logger = logging.getLogger(__name__)
 
 
-class CameraStanding:
-    """One unit's camera, as the master is told of it."""
+class CameraStatus:
+    """Reports the status of one unit's camera to the master."""
 
     def __init__(self, config: UnitConfig, uplink: Uplink) -> None:
-        """Raises ConfigError when the configured pose cannot be read."""
+        """Raises ConfigError if the configured pose cannot be read."""
         self._uplink = uplink
         self._memory = CameraMemory(config.state_dir)
         self._wanted: str | None = getattr(config.source, "serial", None)
@@ -34,7 +34,7 @@ class CameraStanding:
         )
 
     async def opened(self, camera: CameraInfo) -> None:
-        """This one is here: register with it, and remember it."""
+        """Register with the camera that was opened, and store it as the last one."""
         if self._camera is not None and camera.serial != self._camera.serial:
             logger.warning("the camera changed from %s to %s", self._camera.serial, camera.serial)
         self._camera = camera
@@ -44,13 +44,13 @@ class CameraStanding:
         await asyncio.to_thread(self._memory.save, camera)
 
     async def failed(self, error: SourceError) -> None:
-        """It does not deliver."""
+        """Report that the camera delivers no frames."""
         logger.warning("%s", error)
         self._uplink.camera_state.trouble = Trouble("camera", f"camera: {error}")
         await self._register_the_missing()
 
     async def follow(self, source: ReportsStatus) -> None:
-        """Tell each change of the source's status, for the next frame may be long in coming; never returns."""
+        """Report each change of the source's status at once, as the next frame may take long; never returns."""
         status = source.status
         while True:
             if status.state != "closed":
@@ -62,7 +62,7 @@ class CameraStanding:
             status = await source.next_status(status)
 
     async def _register_the_missing(self) -> None:
-        """Have the master know of a camera that should be here: the one that was, if none delivered yet."""
+        """Register with the missing camera: the last one, if none has delivered yet."""
         if self._camera is None:
             remembered = await asyncio.to_thread(self._memory.load)
             if remembered is not None and self._wanted in (None, remembered.serial):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the computer itself tells: when it was booted, whether its clock is set, which cameras hang on its USB."""
+"""Facts of the computer: its boot, the state of its clock, the cameras on its USB."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ INTEL = "8086"
 
 STA_UNSYNC = 0x40
 TIMEX_BYTES, TIMEX_STATUS_AT = 512, 40
-"""See adjtimex(2): more bytes than its structure has, and where the status lies in it on every 64-bit Linux."""
+"""See adjtimex(2): more bytes than its structure has, and the offset of the status on every 64-bit Linux."""
 
 
 def boot_id() -> str:
-    """Changes when the machine's monotonic clock starts anew."""
+    """Return an id that changes when the machine's monotonic clock restarts."""
     try:
         return BOOT_ID.read_text(encoding="ascii").strip()
     except OSError:
@@ -25,7 +25,7 @@ def boot_id() -> str:
 
 
 def clock_is_set() -> bool:
-    """Whether the kernel knows of anyone who keeps its wall clock right."""
+    """Return True if the kernel says that a time service keeps its wall clock right."""
     timex = ctypes.create_string_buffer(TIMEX_BYTES)
     if ctypes.CDLL(None).adjtimex(timex) < 0:
         return False
@@ -34,10 +34,10 @@ def clock_is_set() -> bool:
 
 
 def usb_cameras(devices: Path = Path("/sys/bus/usb/devices")) -> list[str]:
-    """RealSense cameras that the kernel sees, whether or not the SDK may open them, each with its speed."""
+    """Return the RealSense cameras that the kernel lists, each with its speed; the SDK may be unable to open them."""
     found = []
     for vendor in sorted(devices.glob("*/idVendor")):
-        with suppress(OSError):  # it may go while we look
+        with suppress(OSError):  # a camera may be unplugged meanwhile
             product = (vendor.parent / "product").read_text().strip()
             if vendor.read_text().strip() == INTEL and "RealSense" in product:
                 found.append(f"{product} at {(vendor.parent / 'speed').read_text().strip()} Mbit/s")

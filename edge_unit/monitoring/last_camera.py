@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera that was here before, so that a unit that starts without it can tell the master which one is missing."""
+"""The camera of the last run: a unit that starts without it can tell the master which one is missing."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ FILE_NAME = "camera.json"
 
 
 class CameraMemory:
-    """One small file in the unit's state."""
+    """One small file in the unit's state folder."""
 
     def __init__(self, state_dir: Path) -> None:
         self._file = StateFile(state_dir / FILE_NAME)
 
     def save(self, camera: CameraInfo) -> None:
-        """Remember `camera`; where nothing can be written nothing is remembered, and a warning says so."""
+        """Store `camera`; if the file cannot be written, log a warning."""
         self._file.save({"serial": camera.serial, "model": camera.model, "intrinsics": camera.intrinsics.model_dump()})
 
     def load(self) -> CameraInfo | None:
-        """The camera that was remembered, or None; a damaged file is as good as none."""
+        """Return the stored camera; None without a file, or with a damaged one."""
         return self._file.load(_camera_of)
 
 

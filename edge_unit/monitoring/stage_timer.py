@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long a frame spent in each stage of the unit, from its capture on."""
+"""Time that a frame spent in each stage of the unit, from its capture on."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from shared.waiting import LOOP_CLOCK, Clock
 
 
-class Stages:
-    """Nanoseconds by stage, in the order of the flow; together they are the frame's age when the last one ended."""
+class StageTimer:
+    """Nanoseconds by stage, in the order of the flow; their sum is the frame's age at the end of the last stage."""
 
     def __init__(self, captured_at_ns: int, clock: Clock = LOOP_CLOCK) -> None:
         self._clock = clock
@@ -17,7 +17,7 @@ class Stages:
         self._since_ns = captured_at_ns
 
     def end(self, name: str, parts_ns: Mapping[str, int] | None = None) -> None:
-        """A stage ends now; what of it was measured apart as `parts_ns` is told apart, and comes first."""
+        """End a stage now; `parts_ns`, measured separately, are listed separately and first."""
         now_ns = self._clock.now_ns()
         parts_ns = parts_ns or {}
         self.took_ns.update(parts_ns)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the work on frames makes progress: what is being done, and by when it must be done.
+"""Detection of stalled work on frames: each piece of work has a time limit.
 
-Waiting for a camera, a frame or a master is no work and may take for ever; what a thread computes may not.
+Waiting for a camera, a frame or a master is not work and may take any time; a computation in a thread may not.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from shared.clock import NS_PER_S
 from shared.waiting import LOOP_CLOCK, Clock
 
 
-class Progress:
-    """Work that is under way, each piece with its limit."""
+class StallDetector:
+    """Work in progress, each piece with its time limit."""
 
     def __init__(self, clock: Clock = LOOP_CLOCK) -> None:
         self._clock = clock
@@ -22,7 +22,7 @@ class Progress:
 
     @contextmanager
     def working(self, what: str, limit_s: float) -> Iterator[None]:
-        """Whoever enters is at work at `what`, and is stuck when it has not left within `limit_s`."""
+        """Mark `what` as in progress within the context; it is stalled if the context lasts longer than `limit_s`."""
         key = object()
         self._open[key] = what, self._clock.now_ns(), limit_s
         try:
@@ -31,10 +31,10 @@ class Progress:
             del self._open[key]
 
     def stuck(self) -> str | None:
-        """Return what has not come to its end in time, in one sentence; None while all goes well."""
+        """Describe the work that exceeded its limit in one sentence; None if there is none."""
         now_ns = self._clock.now_ns()
         for what, began_ns, limit_s in list(self._open.values()):
             took_s = (now_ns - began_ns) / NS_PER_S
             if took_s > limit_s:
-                return f"{what} has not come to its end for {took_s:.0f} s, expected within {limit_s:g} s"
+                return f"{what} has not finished for {took_s:.0f} s, expected within {limit_s:g} s"
         return None

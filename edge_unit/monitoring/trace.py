@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was reported, frame by frame, in a file for evaluation.
+"""A file of all reports, frame by frame, for evaluation.
 
 A file of msgpack maps, one after the other: `frame_number, captured_at_ns` (the unit's clock), `process_ms`, `keys`
-(ascending little-endian uint32), `shape` and `voxel_size_m` of their lattice, `sent` (false: a newer frame took its
-place before it was sent), and of those that were sent `sent_at_ns`, `received_at_ns` (the master had all of it) and
-`merged_at_ns` (it had merged it), by the unit's clock. `stages_ns` are the nanoseconds that the frame spent in each
-stage from its capture on; empty of one that did not go through all of them.
+(ascending little-endian uint32), `shape` and `voxel_size_m` of their lattice, and `sent` (false: a newer frame replaced
+it before it was sent). A sent frame also has `sent_at_ns`, `received_at_ns` (the master had all of it) and
+`merged_at_ns` (the master had merged it), by the unit's clock. `stages_ns` are the nanoseconds that the frame spent in
+each stage from its capture on; it is empty if the frame did not pass all stages.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from shared.errors import ConfigError
 logger = logging.getLogger(__name__)
 
 MAX_TRACE_BYTES = 2**30
-"""Days of an ordinary cell; a trace that was forgotten must not fill the disk."""
+"""Days of an ordinary cell; a trace that nobody stops must not fill the disk."""
 
 MAX_PENDING = 256
-"""Records kept until they are written, at the next frame."""
+"""Records kept in memory until the next frame writes them."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ class TraceRecord:
 
 
 class Trace:
-    """Collects records on the event loop; `flush` writes them, from a thread."""
+    """Collects records on the event loop; `flush` writes them from a thread."""
 
     def __init__(self, path: Path) -> None:
-        """Raises ConfigError when the file cannot be written."""
+        """Raises ConfigError if the file cannot be written."""
         self._path = path
         self._pending: deque[TraceRecord] = deque(maxlen=MAX_PENDING)
         try:
@@ -66,7 +66,7 @@ class Trace:
         self._pending.append(record)
 
     def note(self, report: Report, delivery: Delivery | None) -> None:
-        """Keep what became of a report; without a `delivery` it was never sent."""
+        """Keep the record of a report; without a `delivery` it was never sent."""
         if report.captured_at_ns is None:
             return
         lattice = report.assignment.lattice
@@ -87,7 +87,7 @@ class Trace:
         )
 
     def flush(self) -> None:
-        """Write what was collected; ends quietly at the file's bound."""
+        """Write the collected records; the trace ends at the file's size limit."""
         while self._pending:
             packed: bytes = msgpack.packb(vars(self._pending.popleft()))
             if len(packed) > self._left:
@@ -100,16 +100,16 @@ class Trace:
         self._file.flush()
 
     def close(self) -> None:
-        """Write the rest."""
+        """Write the rest and close the file."""
         self.flush()
         self._file.close()
 
 
 def read_trace(path: Path) -> list[TraceRecord]:
-    """The records of a trace; one that was cut short ends before its last.
+    """Read the records of a trace; a truncated file yields all complete records.
 
     Raises:
-        ConfigError: the file cannot be read, or is no trace.
+        ConfigError: the file cannot be read, or is not a trace.
     """
     records = []
     try:
@@ -117,7 +117,7 @@ def read_trace(path: Path) -> list[TraceRecord]:
             for fields in msgpack.Unpacker(file, use_list=False):
                 records.append(_record(fields))
     except (OSError, ValueError, TypeError, msgpack.UnpackException) as error:
-        raise ConfigError(f"{path}: no trace: {error}") from error
+        raise ConfigError(f"{path}: expected a trace of a unit (trace_path): {error}") from error
     return records
 
 

@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The method: from a depth frame, its joints and all that is known to voxels of what is not known.
+"""The method: from a depth frame, the joints and all known surfaces to voxels of unknown obstacles.
 
 In the order of the flow:
 
-    stage_times       how long a frame spends in each stage
-    expected_depth    what the camera should see: static layer and robot layer (Algorithms 2 to 5)
-    edge_halo         what edges of the CAD make the camera see beside them
-    background_model  the static layer that is learned of the empty cell
-    static_model      all that stands still: CAD, known objects, background, with their limits
+    stage_times       time that a frame spends in each stage
+    expected_depth    expected depth: static layer and robot layer (Algorithms 2 to 5)
+    edge_halo         false depths that a camera measures beside edges of the CAD
+    background_model  the static layer that is learned from the empty cell
+    static_model      all static surfaces: CAD, known objects, background model, with their limits
     moving_model      the robot at a frame's time, padded for the filter, or bare
-    voxelizer         foreground pixels become voxels of the lattice (Algorithms 1, 6 and 7)
-    visibility        which blocks of the cell a frame looks through
-    fit_check         whether what the camera sees fits what it should see
-    pose_misfit       how badly a frame fits from where the camera should be, and from close by
-    pose_refinement   the camera's pose, refined by what it measures of the CAD
-    frame_result      all that one frame tells, as one value
-    depth_pipeline    the method, one line a stage
-    images            what a unit sees, as PNG
+    voxelizer         turns foreground pixels into voxels of the lattice (Algorithms 1, 6 and 7)
+    visibility        blocks of the cell that a frame looks through
+    fit_check         fit of the measured depth to the expected depth
+    pose_misfit       misfit of a frame at the camera's pose, and at neighbouring poses
+    pose_refinement   refines the camera's pose by the CAD that it measures
+    frame_result      the result of one frame, as one value
+    depth_pipeline    the method, one line for each stage
+    images            the unit's images as PNG
 """
 
-from edge_unit.pipeline.background_model import Reference, ReferenceLearner
+from edge_unit.pipeline.background_model import BackgroundLearner, BackgroundModel
 from edge_unit.pipeline.depth_pipeline import DepthPipeline
 from edge_unit.pipeline.expected_depth import BareRobot
 from edge_unit.pipeline.frame_result import FrameResult
@@ -31,12 +31,12 @@ from edge_unit.pipeline.visibility import SeenBlocks
 from edge_unit.pipeline.voxelizer import Voxels
 
 __all__ = [
+    "BackgroundLearner",
+    "BackgroundModel",
     "BareRobot",
     "DepthPipeline",
     "FrameResult",
     "Misfit",
-    "Reference",
-    "ReferenceLearner",
     "Refiner",
     "SeenBlocks",
     "StageTimes",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The static layer that is learned from the empty cell, for few cells are wholly in CAD."""
+"""The background model: the static layer learned from the empty cell, as few cells are wholly in CAD."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from shared.errors import InputError
 from shared.files import write_whole
 
 SHARE_MIN = 0.15
-"""Who walks through the picture covers a pixel for half a second; of ten seconds of learning that is 5 %. A surface
-that stereo matching shows in one frame of six, at an edge, is real enough to be expected again."""
+"""A person who walks through the image covers a pixel for half a second: 5 % of ten seconds of learning. A surface that
+stereo matching shows in one frame of six, at an edge, is real and must be expected."""
 
 MATCH_BASE_M = 0.03
-"""Depths within this, and three standard deviations of stereo noise, are one surface."""
+"""Depths that differ by less than this plus three standard deviations of stereo noise are one surface."""
 
 MATCH_SIGMAS = 3.0
 
 PRIOR_FRAMES = 4.0
-"""The camera's noise model weighs as much as this many frames when a pixel's spread is reckoned."""
+"""Weight of the camera's noise model in a pixel's spread, in frames."""
 
 MAX_FRAMES = 65535
 """Samples of a pixel are counted in uint16."""
@@ -48,17 +48,17 @@ DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""What numpy and zipfile raise over damaged bytes; a fuzz test knows no other."""
+"""Exceptions of numpy and zipfile for damaged bytes; a fuzz test finds no others."""
 
 FILE_BYTES_MAX = 64 * 1024 * 1024
-"""Two float32 images of the largest camera, uncompressed, and a header: a larger file is not ours."""
+"""Two float32 images of the largest camera, uncompressed, and a header: a larger file is not a background model."""
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
-    """What the empty cell shows: `depth_m` and `spread_m` (H, W) float32 in metres, NaN where nothing was learned.
+class BackgroundModel:
+    """Depth of the empty cell: `depth_m` and `spread_m` (H, W) float32 in metres, NaN where nothing was learned.
 
-    It belongs to one camera at one place: it is void when the camera moved, or its serial or profile changed.
+    It belongs to one camera at one pose: it is void after a move of the camera, or a change of its serial or profile.
     """
 
     depth_m: NDArray[np.float32]
@@ -80,21 +80,21 @@ class Reference:
 
     @property
     def learned_share(self) -> float:
-        """Share of the pixels that have a surface."""
+        """Share of the pixels that have a learned depth."""
         return float(np.isfinite(self.depth_m).mean())
 
     def to_bytes(self) -> bytes:
-        """As a compressed npz."""
+        """Return it as a compressed npz."""
         buffer = io.BytesIO()
         np.savez_compressed(buffer, depth_m=self.depth_m, spread_m=self.spread_m, frames=np.int64(self.frames))
         return buffer.getvalue()
 
     @classmethod
-    def from_bytes(cls, data: bytes) -> Reference:
+    def from_bytes(cls, data: bytes) -> BackgroundModel:
         """Inverse of `to_bytes`.
 
         Raises:
-            InputError: the bytes are no reference.
+            InputError: the bytes are not a background model.
         """
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as stored:
@@ -107,16 +107,16 @@ class Reference:
         """Write to `path`, whole or not at all.
 
         Raises:
-            OSError: it cannot be written; what was there stays.
+            OSError: it cannot be written; the old file stays.
         """
         write_whole(path, self.to_bytes())
 
     @classmethod
-    def load(cls, path: Path) -> Reference:
-        """Read what `save` wrote.
+    def load(cls, path: Path) -> BackgroundModel:
+        """Read a file of `save`.
 
         Raises:
-            InputError: the file is missing, too large, or no reference.
+            InputError: the file is missing, too large, or not a background model.
         """
         try:
             if path.stat().st_size > FILE_BYTES_MAX:
@@ -128,11 +128,11 @@ class Reference:
             raise InputError(f"{path}: {error}") from error
 
 
-class ReferenceLearner:
-    """Collects frames of the empty cell, any number, in memory that does not grow."""
+class BackgroundLearner:
+    """Collects any number of frames of the empty cell in memory of fixed size."""
 
     def __init__(self, intrinsics: Intrinsics, noise_per_m: float, range_max_m: float) -> None:
-        """`noise_per_m` is the `c` of the camera's `sigma(z) = c * z**2`."""
+        """`noise_per_m` is `c` of the camera's `sigma(z) = c * z**2`."""
         shape = (*intrinsics.shape, kernels.MODES)
         self._intrinsics = intrinsics
         self._noise_per_m = noise_per_m
@@ -155,18 +155,18 @@ class ReferenceLearner:
         robot_near_raw: NDArray[np.uint16],
         robot_span_raw: NDArray[np.uint16],
     ) -> None:
-        """Add a frame (H, W); what lies in the robot's band (H, W) is left out.
+        """Add a frame (H, W), except for depths within the robot's band (H, W).
 
         Raises:
-            InputError: there were MAX_FRAMES already.
+            InputError: MAX_FRAMES are reached.
         """
         if self.frames >= MAX_FRAMES:
             raise InputError(f"reference: expected at most {MAX_FRAMES} frames")
         kernels.observe(depth_raw, robot_near_raw, robot_span_raw, self._matching, self._modes)
         self.frames += 1
 
-    def reference(self) -> Reference:
-        """What was learned so far.
+    def reference(self) -> BackgroundModel:
+        """Return the background model of the frames so far.
 
         Raises:
             InputError: there was no frame.
@@ -177,4 +177,4 @@ class ReferenceLearner:
         spread_m = np.empty(self._intrinsics.shape, np.float32)
         prior = plain(kernels.Prior(SHARE_MIN, PRIOR_FRAMES, self._noise_per_m))
         kernels.conclude(self._modes, prior, depth_m, spread_m)
-        return Reference(depth_m, spread_m, self.frames)
+        return BackgroundModel(depth_m, spread_m, self.frames)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The method, one line a stage: from a depth image to the obstacle voxels of the cell."""
+"""The method, one line for each stage: from a depth image to the obstacle voxels of the cell."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edge_unit.pipeline.background_model import Reference, ReferenceLearner
+from edge_unit.pipeline.background_model import BackgroundLearner, BackgroundModel
 from edge_unit.pipeline.fit_check import HealthCheck
 from edge_unit.pipeline.frame_result import FrameResult
 from edge_unit.pipeline.moving_model import EXACT, MovingModel
@@ -33,7 +33,7 @@ Kind = TypeVar("Kind")
 class DepthPipeline:
     """One camera's filter. Not for use from several threads at once.
 
-    All that changes while it runs (`apply`, `move`, `use_cell`, `adopt`, `use`) takes effect with the next frame.
+    Each change (`apply`, `move`, `use_cell`, `adopt`, `use`) takes effect with the next frame.
     """
 
     def __init__(
@@ -43,16 +43,16 @@ class DepthPipeline:
         cell: Cell,
         settings: FilterSettings | None = None,
     ) -> None:
-        """Prepare everything that does not depend on a frame.
+        """Prepare everything that no frame changes.
 
         Args:
-            intrinsics: of the depth camera.
+            intrinsics: intrinsics of the depth camera.
             T_world_camera: (4, 4) pose of its optical frame in the cell.
             cell: the watched workspace.
-            settings: defaults when left out.
+            settings: None: the defaults.
 
         Raises:
-            InputError: an argument is of another type, the pose is no rigid transform, or the lattice would be too
+            InputError: an argument has a wrong type, the pose is not a rigid transform, or the lattice would be too
                 large.
         """
         self.intrinsics = _of_type(intrinsics, Intrinsics, "intrinsics")
@@ -66,7 +66,7 @@ class DepthPipeline:
         self._moving = MovingModel(intrinsics, cell.robot, self.T_world_camera, self.settings)
         self._static = StaticModel(intrinsics, Bodies.of(intrinsics, cell, self.T_world_camera), self.settings)
 
-    # ------------------------------------------------------------------ what a frame goes through
+    # ------------------------------------------------------------------ stages of a frame
 
     def process(
         self,
@@ -76,14 +76,14 @@ class DepthPipeline:
         joint_uncertainty_rad: ArrayLike = EXACT,
         with_misfit: bool = False,
     ) -> FrameResult:
-        """Find the obstacle voxels of one frame, what it looks through, and how well it fits what is known.
+        """Find the obstacle voxels of one frame, its seen blocks, and its fit to the known surfaces.
 
         Args:
             depth: (H, W) uint16 in units of depth_scale_m, 0 where nothing was measured.
-            joints: (n,) rad (m where prismatic) at the frame's time; None when unknown: then the robot is
+            joints: (n,) rad (m where prismatic) at the frame's time; None if they are not known: then the robot is
                 reported, not filtered.
-            joint_uncertainty_rad: how far each joint may be off, one number or (n,); it widens the padding.
-            with_misfit: compare the frame with places close to the camera's pose, too.
+            joint_uncertainty_rad: uncertainty of each joint, one number or (n,); it widens the padding.
+            with_misfit: also compare the frame with poses close to the camera's pose.
 
         Raises:
             InputError: depth or joints have the wrong type, shape or values.
@@ -93,7 +93,7 @@ class DepthPipeline:
         stages = StageRunner()
         robot = stages.run("expected", self._moving.place, joints, joint_uncertainty_rad)
         voxels = self._voxelizer.voxels(depth_raw, known.room_raw, known.minimum_raw, robot, self._static.halo, stages)
-        seen = stages.run("seen", self._visibility.look, depth_raw, known.seen_limit_raw, robot.near_raw)
+        seen = stages.run("seen", self._visibility.find_seen, depth_raw, known.seen_limit_raw, robot.near_raw)
         health = stages.run("health", self._health.check, depth_raw, known.depth_raw, robot.near_raw, settings)
         misfit = None
         if with_misfit:
@@ -117,7 +117,7 @@ class DepthPipeline:
     ) -> NDArray[np.float32]:
         """Return the depth (H, W) in metres of the nearest known surface, unpadded; inf where nothing is known.
 
-        Without joints the robot is not known. The uncertainty pads the filter only, never what is expected.
+        Without joints the robot counts as unknown. The uncertainty widens the filter only, never the expected depth.
         """
         nearest_m = self._static.images.depth_m.copy()
         self._moving.lower(joints, joint_uncertainty_rad, nearest_m)
@@ -125,14 +125,14 @@ class DepthPipeline:
 
     # ------------------------------------------------------------------ learning the empty cell
 
-    def learn(self, frames: Iterable[tuple[NDArray[np.uint16], ArrayLike | None]]) -> Reference:
-        """Learn the static layer from frames of the empty cell; `use` makes it count.
+    def learn(self, frames: Iterable[tuple[NDArray[np.uint16], ArrayLike | None]]) -> BackgroundModel:
+        """Learn the background model from frames of the empty cell; `use` makes it part of the static layer.
 
         Args:
             frames: pairs of depth (H, W) uint16 and joints (n,).
 
         Raises:
-            InputError: there was no frame, one is no such pair, or one of a cell with a robot came without joints.
+                InputError: there was no frame, one is not a pair, or the cell has a robot and joints are missing.
         """
         learner = self.learner()
         pairs: Iterable[object] = _of_type(frames, Iterable, "frames")
@@ -143,86 +143,86 @@ class DepthPipeline:
             self.learn_frame(learner, *pair)
         return learner.reference()
 
-    def learner(self) -> ReferenceLearner:
+    def learner(self) -> BackgroundLearner:
         """Return a learner for this camera, to be fed with `learn_frame`."""
-        return ReferenceLearner(self.intrinsics, self._noise_per_m, self.settings.range_max_m)
+        return BackgroundLearner(self.intrinsics, self._noise_per_m, self.settings.range_max_m)
 
-    def learn_frame(self, learner: ReferenceLearner, depth: NDArray[np.uint16], joints: ArrayLike | None) -> None:
+    def learn_frame(self, learner: BackgroundLearner, depth: NDArray[np.uint16], joints: ArrayLike | None) -> None:
         """Add one frame of the empty cell to `learner`; arguments and errors as in `learn`.
 
-        The robot is left out by its own padded render, but for the links that never move: they belong to what stands
-        still, and leaving them out would leave an unlearned ring around the base.
+        The robot's pixels are left out by its padded render. Links that never move are static and are learned, since
+        leaving them out would leave an unlearned ring around the base.
         """
-        _of_type(learner, ReferenceLearner, "learner")
+        _of_type(learner, BackgroundLearner, "learner")
         depth_raw = self.intrinsics.check_depth(depth)
         if self.cell.robot is not None and joints is None:
-            raise InputError("learn: expected joints with every frame, for the robot must not be learned as background")
+            raise InputError("learn: expected joints with each frame, as the robot must not be learned as background")
         robot = self._moving.place(joints, without_fixed_links=True)
         learner.add(depth_raw, robot.near_raw, robot.span_raw)
 
-    def use(self, reference: Reference | None) -> None:
-        """Make `reference` part of the static layer from now on; None takes it out.
+    def use(self, reference: BackgroundModel | None) -> None:
+        """Make `reference` part of the static layer from now on; None removes it.
 
         Raises:
-            InputError: it is no reference, or was learned by a camera of another resolution; the old one stays.
+            InputError: it is not a background model, or is of another resolution; the old one stays.
         """
-        self._static.use(None if reference is None else _of_type(reference, Reference, "reference"))
+        self._static.use(None if reference is None else _of_type(reference, BackgroundModel, "reference"))
 
     @property
-    def reference(self) -> Reference | None:
+    def reference(self) -> BackgroundModel | None:
         """The background model in use."""
         return self._static.reference
 
-    # ------------------------------------------------------------------ refining the pose
+    # ------------------------------------------------------------------ refinement of the pose
 
     def without_robot(self, depth: NDArray[np.uint16], joints: ArrayLike | None) -> NDArray[np.uint16]:
-        """Copy a frame (H, W), with nothing measured where the padded robot may stand; errors as `process`.
+        """Copy a frame (H, W), with depth 0 where the padded robot may be; errors as `process`.
 
-        Without joints the robot stays in the picture: it may be anywhere.
+        Without joints the robot's pixels stay in the image: its position is not known.
         """
         bare = self.intrinsics.check_depth(depth).copy()
         bare[self._moving.place(joints).near_raw < limits.RAW_MAX] = 0
         return bare
 
     def refiner(self) -> Refiner:
-        """Return what finds a better pose by the CAD, from frames of `without_robot`; `move` makes it count."""
+        """Return a refiner: it refines the pose by the CAD, from frames of `without_robot`; `move` applies its pose."""
         return Refiner(self.intrinsics, self.T_world_camera, self._static.bodies.depth_m(), self._noise_per_m)
 
-    # ------------------------------------------------------------------ what may change while it runs
+    # ------------------------------------------------------------------ changes at run time
 
     @property
     def lattice(self) -> Lattice:
-        """The lattice on which voxels are reported."""
+        """The lattice of the reported voxels."""
         return self._voxelizer.lattice
 
     @property
     def static_version(self) -> int:
-        """A number that rises whenever what stands still, or is known of it, changes."""
+        """A number that rises with each change of the static layer."""
         return self._static.version
 
     def apply(self, settings: FilterSettings) -> None:
-        """Work with other settings from now on.
+        """Use other settings from now on.
 
         Raises:
-            InputError: these are no settings, or the lattice would be too large; the old settings stay.
+            InputError: the type is wrong, or the lattice would be too large; the old settings stay.
         """
         self.adopt(self.cell, settings)
 
     def use_cell(self, cell: Cell) -> None:
-        """Work with another cell from now on, or with known objects that stand elsewhere.
+        """Use another cell from now on, or the same with moved objects.
 
         Raises:
-            InputError: it is no cell, or its lattice would be too large; the old one stays.
+            InputError: the type is wrong, or its lattice would be too large; the old cell stays.
         """
         self.adopt(cell, self.settings)
 
     def adopt(self, cell: Cell, settings: FilterSettings) -> None:
-        """Work with another cell and other settings from now on: both, or neither when one of them cannot be.
+        """Use another cell and other settings from now on: both, or neither if one of them is invalid.
 
-        Only what changed is prepared anew: robot and meshes that are the same objects as before are kept.
+        Only changes are prepared anew: the robot and meshes that are the same objects as before are kept.
 
         Raises:
-            InputError: an argument is of another type, or the lattice would be too large; the old ones stay.
+            InputError: an argument has a wrong type, or the lattice would be too large; the old ones stay.
         """
         _of_type(cell, Cell, "cell")
         _of_type(settings, FilterSettings, "settings")
@@ -239,13 +239,13 @@ class DepthPipeline:
         self._static.change(bodies, settings)
 
     def move(self, T_world_camera: ArrayLike, *, refined: bool = False) -> None:
-        """Take another pose of the camera from now on.
+        """Use another pose of the camera from now on.
 
-        What was learned belonged to the old place and is void, unless the pose was only `refined`: then the camera
-        did not move, we merely know better where it stands.
+        The background model belongs to the old pose and is dropped, unless the pose was only `refined`: then the
+        camera did not move, and only the knowledge of its pose is better.
 
         Raises:
-            InputError: the pose is no rigid transform; the old one stays.
+            InputError: the pose is not a rigid transform; the old one stays.
         """
         self.T_world_camera = validated(T_world_camera, "T_world_camera")
         self._voxelizer.place(self.T_world_camera)
@@ -255,7 +255,7 @@ class DepthPipeline:
             self._static.reference = None
         self._static.change(self._static.bodies.drawn(self.T_world_camera), self.settings)
 
-    # ------------------------------------------------------------------ its parts
+    # ------------------------------------------------------------------ parts
 
     def _voxelizer_of(self, cell: Cell, settings: FilterSettings) -> Voxelizer:
         return Voxelizer(self.intrinsics, self.T_world_camera, cell.lattice(settings.voxel_size_m), settings)
@@ -273,7 +273,7 @@ class DepthPipeline:
 
     @property
     def _noise_per_m(self) -> float:
-        """The camera's noise `c` of `sigma(z) = c * z**2`, 1/m."""
+        """`c` of the camera's noise `sigma(z) = c * z**2`, 1/m."""
         return self.intrinsics.disparity_noise_m(self.settings.stereo_subpixel_px)
 
 
@@ -282,7 +282,7 @@ def _same_box(one: Cell, other: Cell) -> bool:
 
 
 def _of_type(value: Kind, kind: type, name: str) -> Kind:
-    """Return `value` if it is a `kind`; where types are not checked, a wrong one must not fail half-way."""
+    """Return `value` if it is a `kind`; without static type checks a wrong one must not fail half-way."""
     if not isinstance(value, kind):
         raise InputError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
     return value

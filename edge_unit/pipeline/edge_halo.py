@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What edges of the CAD make the camera see beside them; learned surfaces have shown their halo already."""
+"""False depths that a camera measures beside edges of the CAD; a background model already contains its own."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shared.camera import Intrinsics
 
 
 class EdgeHalo:
-    """The pixels beside known edges, each with the band of depths that an edge explains there.
+    """Pixels beside known edges, each with the band of depths that its edge explains.
 
     Attributes:
         runs: (R, 4) int32, the pixels as runs of neighbours, see `runs_of`.
@@ -54,18 +54,18 @@ class EdgeHalo:
         self.bundle = plain(halo.Halo(self.runs, self.near_raw, self.span_raw))
 
     def drop(self, depth_raw: NDArray[np.uint16], mask: NDArray[np.uint8]) -> None:
-        """Take out of `mask` (H, at least W) what an edge explains."""
+        """Remove the pixels that an edge explains from `mask` (H, at least W)."""
         halo.drop_halo(depth_raw, 0, self.bundle, mask)
 
     def lower(self, limit_raw: NDArray[np.uint16], out: NDArray[np.uint16]) -> None:
-        """`limit_raw` (H, W) into `out`, but where a halo may hide something no farther than its near end."""
+        """Copy `limit_raw` (H, W) to `out`; a halo that may hide something lowers it to the near end of its band."""
         np.copyto(out, limit_raw)
         flat = out.reshape(-1)
         flat[self._pixels] = np.minimum(flat[self._pixels], self.near_raw)
 
 
 def runs_of(pixels: NDArray[np.int32], width: int) -> NDArray[np.int32]:
-    """Pixels (N,) `y * width + x`, ascending, as runs (R, 4) of neighbours: row, first column, start and end in N."""
+    """Return pixels (N,) `y * width + x`, ascending, as runs (R, 4): row, first column, start and end in N."""
     is_first = np.ones(len(pixels), np.bool_)
     is_first[1:] = (np.diff(pixels) != 1) | (pixels[1:] % width == 0)
     starts = np.flatnonzero(is_first)

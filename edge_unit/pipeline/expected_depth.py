@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the camera should see, in two layers that stay apart: what stands still, and the robot (Algorithms 2 to 5).
+"""Expected depth, in two layers that stay apart: static surfaces, and the robot (Algorithms 2 to 5).
 
-The static layer is drawn when the camera or a known object moves. The robot is drawn again when its joints moved,
-only inside the rectangles of its links, as solids that are its padding larger, so that the filter only compares.
+The static layer is drawn after a move of the camera or of a known object. The robot is drawn after a move of its
+joints, only inside the rectangles of its links, as solids enlarged by the padding, so that the filter only compares.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from shared.transforms import Transform, inverse
 
 
 class StaticLayer:
-    """Bodies that stand still, CAD or known objects: drawn once for each pose of theirs and the camera's; unpadded.
+    """Static bodies, CAD or known objects, unpadded: drawn once for each pose of theirs and the camera's.
 
     Attributes:
         nearest_w: inverse depth (H, W) of the nearest surface, 1/m; 0 where there is none.
     """
 
     def __init__(self, intrinsics: Intrinsics, bodies: Sequence[PlacedMesh], batch: MeshBatch | None = None) -> None:
-        """`batch` has their meshes already."""
+        """`batch` already has their meshes."""
         self._intrinsics = intrinsics
         self._bodies = tuple(bodies)
         self._batch = batch or MeshBatch(intrinsics, [body.mesh for body in bodies], inflate=False)
@@ -38,14 +38,14 @@ class StaticLayer:
         self.nearest_w = np.zeros(intrinsics.shape, np.float32)
 
     def of(self, bodies: Sequence[PlacedMesh]) -> StaticLayer:
-        """The layer of these bodies: this one if they stand where they stood, else a new one with the same meshes."""
+        """Return the layer of these bodies: this one if no pose changed, else a new one with the same meshes."""
         if _stand_still(self._bodies, bodies):
             return self
         same_meshes = [body.mesh for body in bodies] == [body.mesh for body in self._bodies]
         return StaticLayer(self._intrinsics, bodies, self._batch if same_meshes else None)
 
     def draw(self, T_world_camera: Transform) -> None:
-        """Draw all bodies as the camera sees them from here, unless they are drawn so already."""
+        """Draw all bodies from the camera's pose, unless they are drawn for it already."""
         if self._T_world_camera is not None and np.array_equal(T_world_camera, self._T_world_camera):
             return
         self._T_world_camera = T_world_camera
@@ -58,7 +58,7 @@ class StaticLayer:
 
 
 def _stand_still(old: Sequence[PlacedMesh], new: Sequence[PlacedMesh]) -> bool:
-    """Whether the same meshes stand at the same places; a mesh is the same only as the same object."""
+    """Return True if the same meshes have the same poses; a mesh is the same only as the same object."""
     return len(old) == len(new) and all(
         one.mesh is other.mesh and np.array_equal(one.T_world_mesh, other.T_world_mesh)
         for one, other in zip(old, new, strict=True)
@@ -66,21 +66,21 @@ def _stand_still(old: Sequence[PlacedMesh], new: Sequence[PlacedMesh]) -> bool:
 
 
 class RobotLayer:
-    """The padded robot, as the band of raw depths that belongs to it.
+    """The padded robot, as the band of raw depths that it covers.
 
     Attributes:
-        padding_m: (L,) float32, what the links are usually drawn with.
+        padding_m: (L,) float32, the usual padding of the links.
         near_raw, span_raw: (H, W) uint16, the band's lower end and its length.
-        columns: (H, 2) int32, of each row the first column and the one after the last that may have a band.
+        columns: (H, 2) int32, for each row the first column and the one after the last that may have a band.
         bundle: all three, for kernels.
     """
 
     def __init__(self, intrinsics: Intrinsics, robot: Robot | None, padding_m: float) -> None:
-        """`padding_m` is what the links are usually drawn with: they are prepared for it."""
+        """`padding_m` is the usual padding of the links: their padded meshes are prepared for it."""
         self._intrinsics = intrinsics
         self._hull_m = max(padding_m, DISTANCE_MIN_M)
         hulls = [hull_around(link.mesh, self._hull_m) for link in robot.links] if robot else []
-        # With their backs: a link that points at the camera is as deep as it is long.
+        # With their backs: a link that points at the camera has a depth as large as its length.
         self._drawing = LinkDrawing(intrinsics, hulls, inflate=True, farthest=True)
         self._is_shown = False
         self.padding_m = np.full(len(hulls), padding_m, np.float32)
@@ -90,7 +90,7 @@ class RobotLayer:
         self.bundle = plain(limits.Band(self.near_raw, self.span_raw, self.columns))
 
     def forget(self) -> None:
-        """Take the robot out: without joints nobody knows where it stands, and it is reported, not filtered."""
+        """Remove the robot: without joints its position is not known, and it is reported, not filtered."""
         limits.clear_band(self.bundle)
         self._is_shown = False
 
@@ -102,9 +102,9 @@ class RobotLayer:
         depth_m: float,
         hidden: NDArray[np.bool_] | None = None,
     ) -> bool:
-        """Draw the links at poses (L, 4, 4), each grown by its padding (L,) m; returns False when none had moved.
+        """Draw the links at poses (L, 4, 4), each with its padding (L,) m; returns False if none had moved.
 
-        `noise_per_m` and `depth_m`, from the padded surface, widen the band as `limits.robot_band_raw` has it.
+        `noise_per_m` and `depth_m`, from the padded surface, widen the band, see `limits.robot_band_raw`.
         `hidden` (L,) links are left out.
         """
         if hidden is not None and hidden.any():
@@ -130,7 +130,7 @@ class RobotLayer:
 
 
 class BareRobot:
-    """The robot as it is, without padding: for pictures and for `expected_depth`, not for the filter."""
+    """The robot without padding: for images and for `expected_depth`, not for the filter."""
 
     def __init__(self, intrinsics: Intrinsics, robot: Robot | None) -> None:
         meshes = [link.mesh for link in robot.links] if robot else []
@@ -138,7 +138,7 @@ class BareRobot:
         self._no_padding_m = np.zeros(len(meshes), np.float32)
 
     def lower(self, T_camera_link: NDArray[np.float64], depth_m: NDArray[np.float32]) -> None:
-        """Lower `depth_m` (H, W) to the links at poses (L, 4, 4) where they are nearer."""
+        """Lower `depth_m` (H, W) to the links at poses (L, 4, 4) that are nearer."""
         drawing = self._drawing
         drawing.draw(T_camera_link, self._no_padding_m)
         limits.lower_depth(drawing.buffer.bundle, drawing.rectangles, drawing.all, depth_m)

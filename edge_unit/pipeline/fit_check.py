@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does what the camera sees still fit what it should see?"""
+"""Fit of the measured depth to the expected depth."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from shared.camera import Intrinsics
 from shared.settings import FilterSettings
 
 STRIDE_PX = 8
-"""One pixel in 64 is looked at: 14,400 of the largest image, a hundred times more than shares need."""
+"""One pixel in 64 is checked: 14,400 of the largest image, a hundred times more than shares need."""
 
 
 @dataclass(frozen=True)
 class Health:
-    """What each update tells of its frame.
+    """The health of a frame, which each update carries.
 
     Attributes:
-        valid_share: share of the pixels that were measured.
-        agreeing_share: share of the measured pixels before a known static surface that lie within its margin.
+        valid_share: share of the measured pixels.
+        agreeing_share: share of the measured pixels on a known static surface that lie within its margin.
         residual_share: median of measured less expected depth of those, in parts of the margin (-1 to 1).
-        static_share: share of the pixels before a known static surface; where it is 0 the two above are 0 too.
+        static_share: share of the pixels on a known static surface; where it is 0 the two above are 0 too.
     """
 
     valid_share: float

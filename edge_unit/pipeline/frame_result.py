@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All that one frame tells, as one value: it holds no memory of the frame's source, and no later frame changes it."""
+"""The result of one frame as one value: it holds no memory of the source, and no later frame changes it."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from edge_unit.pipeline.voxelizer import Voxels
 
 @dataclass(frozen=True, eq=False)
 class FrameResult:
-    """What one frame tells.
+    """The result of one frame.
 
     Attributes:
-        voxels: where something stands that nothing known explains.
+        voxels: the obstacle voxels, which no known surface explains.
         seen: the blocks of the cell that the frame looks through.
-        health: how well the frame fits what is known.
-        times: how long each stage took.
-        misfit: how badly the frame fits from the camera's pose and from places close by; None where not asked for.
+        health: the fit of the frame to the known surfaces.
+        times: the time that each stage took.
+        misfit: misfit of the frame at the camera's pose and at neighbouring poses; None if not requested.
     """
 
     voxels: Voxels

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a unit sees, as PNG, for people who ask to see it."""
+"""The unit's images as PNG, on request."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from shared.messages import PICTURE_RANGE_M
 
 RAW_MAX = 65535
 BEHIND_HEADER = 33
-"""Where a chunk may follow in a PNG: behind its signature and its header."""
+"""Offset at which a chunk may be inserted into a PNG: behind its signature and its header."""
 
 
 def picture_raw(
@@ -27,9 +27,9 @@ def picture_raw(
     joints: ArrayLike | None,
     joint_uncertainty_rad: ArrayLike,
 ) -> NDArray[np.uint16]:
-    """A picture (H, W) in units of depth_scale_m, 0 for nothing: what is expected, or what the filter leaves.
+    """Return an image (H, W) in units of depth_scale_m, 0 for nothing: the expected depth, or the foreground.
 
-    Takes some milliseconds and belongs between two frames; it is the pipeline's own thread that may call it.
+    It takes some milliseconds between two frames; call it only from the pipeline's own thread.
     """
     if kind == "expected":
         raw = np.rint(pipeline.expected_depth(joints) / pipeline.intrinsics.depth_scale_m)
@@ -39,11 +39,11 @@ def picture_raw(
 
 
 def png_of(picture: NDArray[np.uint16], depth_scale_m: float, raw: bool) -> bytes:
-    """A picture (H, W) as PNG: with 16 bits, or in colours over PICTURE_RANGE_M, near red, far blue, nothing black."""
+    """Encode an image (H, W) as PNG: 16 bits, or colours over PICTURE_RANGE_M (near red, far blue, nothing black)."""
     image = picture if raw else _colours(picture, depth_scale_m)
     done, data = cv2.imencode(".png", image)
     if not done:
-        raise InputError(f"picture of {picture.shape}: it cannot be written as PNG")
+        raise InputError(f"image of {picture.shape}: it cannot be encoded as PNG")
     text = f"depth_scale_m\0{depth_scale_m:g}" if raw else "X-Depth-Range-M\0{:g} {:g}".format(*PICTURE_RANGE_M)
     png = data.tobytes()
     return png[:BEHIND_HEADER] + _chunk(b"tEXt", text.encode("latin-1")) + png[BEHIND_HEADER:]

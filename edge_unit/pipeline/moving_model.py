@@ -15,7 +15,7 @@ from shared.settings import FilterSettings
 from shared.transforms import Transform, inverse
 
 EXACT: ArrayLike = 0.0
-"""The uncertainty of joints that are known."""
+"""The uncertainty of exactly known joints."""
 
 
 class MovingModel:
@@ -23,7 +23,7 @@ class MovingModel:
 
     Attributes:
         robot: None in a cell without one.
-        band: the depths that belong to the padded robot as it was placed last.
+        band: the depths that the padded robot covers at its last joints.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class MovingModel:
         band: RobotLayer | None = None,
         bare: BareRobot | None = None,
     ) -> None:
-        """`band` and `bare` are of the same robot, and `band` of the same padding, where they are there already."""
+        """`band` and `bare` of the same robot, and `band` of the same padding, are taken over if given."""
         self._intrinsics = intrinsics
         self._settings = settings
         self._bare = bare or BareRobot(intrinsics, robot)
@@ -45,7 +45,7 @@ class MovingModel:
         self.move(T_world_camera)
 
     def changed(self, robot: Robot | None, settings: FilterSettings, T_world_camera: Transform) -> MovingModel:
-        """Return the model of another robot or other settings; what is the same as before is kept."""
+        """Return the model of another robot or other settings; unchanged parts are kept."""
         if robot is not self.robot:
             return MovingModel(self._intrinsics, robot, T_world_camera, settings)
         same_padding = settings.robot_padding_m == self._settings.robot_padding_m
@@ -53,7 +53,7 @@ class MovingModel:
         return MovingModel(self._intrinsics, robot, T_world_camera, settings, band=band, bare=self._bare)
 
     def move(self, T_world_camera: Transform) -> None:
-        """Place the robot's base before a camera that stands elsewhere from now on."""
+        """Draw the robot for another pose of the camera from now on."""
         robot = self.robot
         self._links = Links(robot, inverse(T_world_camera)) if robot else None
         self._is_fixed = np.array([not link.moving for link in (robot.links if robot else ())], np.bool_)
@@ -62,11 +62,11 @@ class MovingModel:
     def place(
         self, joints: ArrayLike | None, joint_uncertainty_rad: ArrayLike = EXACT, *, without_fixed_links: bool = False
     ) -> RobotLayer:
-        """Draw the padded robot as it stood when the frame was taken; returns its band of depths.
+        """Draw the padded robot at the frame's time; returns its band of depths.
 
         Args:
-            joints: (n,) rad (m where prismatic); None when unknown: then no depth belongs to the robot.
-            joint_uncertainty_rad: how far each joint may be off, one number or (n,); it widens the padding.
+            joints: (n,) rad (m where prismatic); None if they are not known: then the band is empty.
+            joint_uncertainty_rad: uncertainty of each joint, one number or (n,); it widens the padding.
             without_fixed_links: leave out the links that never move.
 
         Raises:
@@ -88,7 +88,7 @@ class MovingModel:
             T_camera_link,
             padding_m,
             settings.margin_noise_gain * self._intrinsics.disparity_noise_m(settings.stereo_subpixel_px),
-            # The padded surface stands before the true one by the padding.
+            # The padded surface lies before the true one by the padding.
             settings.robot_depth_m + most_m,
             self._is_fixed if without_fixed_links else None,
         )
@@ -101,7 +101,7 @@ class MovingModel:
             self._bare.lower(self._links.place(joints), depth_m)
 
     def _checked(self, joint_uncertainty_rad: ArrayLike) -> NDArray[np.float64] | None:
-        """The uncertainty (n,) of each joint; None when there is none."""
+        """Return the uncertainty (n,) of each joint; None if there is none."""
         if joint_uncertainty_rad is EXACT:
             return None
         count = self.robot.joint_count if self.robot else 0

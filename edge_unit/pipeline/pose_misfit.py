@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How badly a frame fits what is known, from where the camera should be and from places close by.
+"""Misfit of a frame to the known surfaces, at the camera's pose and at neighbouring poses.
 
-A knocked camera still agrees with most of what it should see, within the noise of one pixel; thousands of pixels
-together tell which of two poses explains a frame better, along edges as well as on planes. Nothing is drawn for it:
-the measured points are looked up in the one picture that is expected.
+A knocked camera still agrees with most of its expected depth, within the noise of one pixel. Thousands of pixels
+together show which of two poses explains a frame better, along edges as well as on planes. Nothing is drawn for it: the
+measured points are looked up in one expected image.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from shared.transforms import from_xyz_rpy
 
 STEP_RAD = np.radians(0.7)
 STEP_M = 0.015
-"""How far away the places close by are: less than a knock that matters, more than a pixel."""
+"""Distance of the neighbouring poses: less than a knock that matters, more than a pixel."""
 
 STEPS = np.array([STEP_RAD] * 3 + [STEP_M] * 3)
-"""Of the six axes: turns about the camera's x, y and z, and shifts along them."""
+"""Steps on the six axes: turns about the camera's x, y and z, and shifts along them."""
 
 COLUMNS_LOOKED_AT = 106
-"""Some 6,000 pixels: edges are met often enough, and a check costs a third of a frame."""
+"""Some 6,000 pixels: enough of them lie at edges, and a check costs a third of a frame."""
 
 SCALE_BASE_M = 0.01
 SCALE_NOISE_GAIN = 1.5
@@ -38,14 +38,14 @@ SCALE_NOISE_GAIN = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Misfit:
-    """What one frame tells of its camera's stance.
+    """The fit of one frame at its camera's pose.
 
     Attributes:
         slope: (6,) misfit a pixel one step ahead on each axis less that one step back; 0 where the pose is right.
-        curvature: (6,) the sum of both less twice that of the expected pose: how much an axis can be told at all.
-        valid_share: share of the pixels that were measured.
-        beyond_share: of the pixels compared, those farther away than the known surface there.
-        static_share: share of the pixels before a known static surface.
+        curvature: (6,) the sum of both less twice the misfit of the expected pose: how well an axis is determined.
+        valid_share: share of the measured pixels.
+        beyond_share: of the pixels compared, the share that is farther away than the known surface.
+        static_share: share of the pixels on a known static surface.
     """
 
     slope: NDArray[np.float64]
@@ -106,7 +106,7 @@ class MisfitCheck:
 
 
 def _places(depth_scale_m: float) -> NDArray[np.float64]:
-    """The expected place, and one step ahead and back on each axis; translations in raw units."""
+    """Return the expected pose, and one step ahead and back on each axis; translations in raw units."""
     places = [np.eye(4)]
     for axis in range(6):
         for sign in (1.0, -1.0):

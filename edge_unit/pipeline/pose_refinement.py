@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera's pose, refined by what it measures of the CAD.
+"""Refinement of the camera's pose by the CAD that it measures.
 
-Point to plane, as in Chen and Medioni (1992), but over a robust cost that also feels edges: where the border of a
-table lies says what its top cannot. Newton's method on six axes with finite differences; the measured points are
-looked up in one expected picture, so a step costs milliseconds. What cannot be told from what is in view is left as
-it was. A pose that is worse, or far from the old one, is never accepted.
+Point to plane, as in Chen and Medioni (1992), but over a robust cost that also uses edges: the border of a table fixes
+axes that its top leaves free. Newton's method on six axes with finite differences; the measured points are looked up in
+one expected image, so a step costs milliseconds. An axis that the view does not determine keeps its old value. A pose
+that is worse, or far from the old one, is never accepted.
 """
 
 from __future__ import annotations
@@ -23,54 +23,54 @@ from shared.errors import InputError
 from shared.transforms import Transform, from_xyz_rpy
 
 UNITS = np.array([np.radians(0.25)] * 3 + [0.005] * 3)
-"""A turn and a shift that count alike: at a metre they move what is seen by as much."""
+"""A turn and a shift of equal weight: at a metre both move the image by the same amount."""
 
 REACH, SAMPLES = 4.0, 12
-"""How far, in units, and how finely a direction is searched that only edges tell of."""
+"""Range, in units, and step of the search along a direction that only edges determine."""
 
 SCALES = (8.0, 4.0, 2.0, 1.0, 0.5)
-"""Of the robust cost, from coarse to fine, in parts of the finest."""
+"""Scales of the robust cost, from coarse to fine, in parts of the finest."""
 
 ITERATIONS = 8
-"""Newton steps a scale; it takes three to five."""
+"""Newton steps for each scale; it needs three to five."""
 
 EDGE_BEND = 1e-3
-"""Inverse depth that bends by more of itself over three pixels crosses an edge."""
+"""If inverse depth bends by more than this part of itself over three pixels, an edge is crossed."""
 
 SCALE_BASE_M = 0.006
 SCALE_NOISE_GAIN = 0.3
 """The finest scale: 10 mm and so many standard deviations of stereo noise."""
 
 POINTS_MAX = 160_000
-"""Diagonals so far apart are taken that about so many remain; more tell the same."""
+"""Diagonals of pixels are thinned so that about so many points remain; more do not improve the result."""
 
 POINTS_MIN = 2_000
-"""Of points near known surfaces; with fewer a pose is not refined."""
+"""Points near known surfaces; with fewer a pose is not refined."""
 
 FIRMNESS_MIN = 0.001
-"""A direction in which the cost is curved less than this part of the firmest one is left as it was."""
+"""A direction in which the cost is curved less than this part of the firmest one keeps its old value."""
 
 FAR_RAD = np.radians(5.0)
 FAR_M = 0.10
-"""What is farther away than this was no small error: let the board be looked for."""
+"""Beyond this distance the error was not small: calibrate with the board."""
 
 CONVERGED = 0.02
-"""In steps: 0.1 mm, 0.005 degrees."""
+"""Size of the last step: 0.1 mm, 0.005 degrees."""
 
 GAIN_MIN = 0.01
-"""The cost must fall by this part of itself, or the old pose is as good."""
+"""The cost must fall by this part of itself, or the old pose is kept."""
 
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """What came of it.
+    """The result of a refinement.
 
     Attributes:
-        T_world_camera: the refined pose; the old one when it was not accepted.
-        accepted: whether it is better, and near.
-        reason: in words, why not; or what it gained.
+        T_world_camera: the refined pose; the old one if it was not accepted.
+        accepted: True if it is better, and near.
+        reason: the gain in words, or the reason against it.
         before_mm, after_mm: median distance of the measured points from the known planes.
-        moved_mm, moved_deg: how far the refined pose is from the old one.
+        moved_mm, moved_deg: distance of the refined pose from the old one.
     """
 
     T_world_camera: Transform
@@ -85,8 +85,8 @@ class Refinement:
 class Refiner:
     """Refines one camera's pose.
 
-    `expected_m` (H, W) is the depth of the CAD from the old pose, in metres, inf where nothing is known; without what
-    was learned, for that was measured by the camera itself.
+    `expected_m` (H, W) is the depth of the CAD from the old pose, in metres, inf where nothing is known; without the
+    background model, since the camera itself measured that.
     """
 
     def __init__(
@@ -131,11 +131,11 @@ class Refiner:
         moved_m, moved_rad = float(np.linalg.norm(T[:3, 3])), _angle(T)
         moved = f"{1000.0 * moved_m:.1f} mm and {np.degrees(moved_rad):.2f} degrees"
         if moved_m > FAR_M or moved_rad > FAR_RAD:
-            why = f"what fits best is {moved} away, too far to be trusted: have the board looked for"
+            why = f"the best fit is {moved} away, too far to be trusted: calibrate with the board"
             return self._refused(why, before_mm, after_mm, moved_m, moved_rad)
         if after > (1.0 - GAIN_MIN) * before:
             return self._refused(
-                f"the pose is as good as it gets: planes are {before_mm:.1f} mm off in the median",
+                f"the pose is already the best: planes are {before_mm:.1f} mm off in the median",
                 before_mm,
                 after_mm,
                 moved_m,
@@ -156,7 +156,7 @@ class Refiner:
     def _points(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
         camera = self._intrinsics
         v, u = np.nonzero(np.isfinite(depth_m) & (depth_m > 0.0))
-        # By their place: were they counted, one pixel more or less would choose all others anew, in columns.
+        # By position: chosen by count, one pixel more or less would choose all others anew, in columns.
         chosen = (u + v) % (-(-len(v) // POINTS_MAX) or 1) == 0
         v, u = v[chosen], u[chosen]
         z = depth_m[v, u]
@@ -175,14 +175,14 @@ class _Search:
         self._distances_m = np.empty(points_m.shape[1], np.float32)
 
     def cost(self, T_expected_there: Transform, coarseness: float) -> tuple[float, NDArray[np.float32]]:
-        """The cost of a pose, and the points' distances from the planes (N,) in metres."""
+        """Return the cost of a pose, and the points' distances from the planes (N,) in metres."""
         r = self._refiner
         measured = plain(align.Measured(self._points_m, np.float32(coarseness) * self._scale_m))
         cost = align.plane_cost(measured, r._expected, r._camera, T_expected_there, self._distances_m)
         return cost, self._distances_m
 
     def run(self) -> Transform:
-        """The pose of the least cost near the expected one."""
+        """Return the pose of the least cost near the expected one."""
         T = np.eye(4)
         for coarseness in SCALES:
             for _ in range(ITERATIONS):
@@ -200,7 +200,7 @@ class _Search:
         return T
 
     def _towards_planes(self, T: Transform, coarseness: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """A step of Gauss and Newton (6,), and the directions (K, 6) in which the planes leave the pose free."""
+        """Return a Gauss-Newton step (6,), and the directions (K, 6) in which the planes leave the pose free."""
         r = self._refiner
         information, gradient = np.empty((6, 6)), np.empty(6)
         measured = plain(align.Measured(self._points_m, np.float32(coarseness) * self._scale_m))
@@ -211,7 +211,7 @@ class _Search:
         return step * UNITS, (axes[:, ~firm] * UNITS[:, None]).T
 
     def _along(self, T: Transform, direction: NDArray[np.float64], coarseness: float) -> Transform:
-        """The best pose along a direction that only edges tell of."""
+        """Return the best pose along a direction that only edges determine."""
         reach = np.linspace(-REACH, REACH, 2 * SAMPLES + 1) * coarseness
         costs = [self.cost(_moved_by(share * direction) @ T, coarseness)[0] for share in reach]
         best = int(np.argmin(costs))
@@ -227,7 +227,7 @@ class _Search:
 def planes_of(
     expected_m: NDArray[np.float32], intrinsics: Intrinsics
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Of the planes in a depth image (H, W): obliqueness (H, W) and normals (H, W, 3), NaN at edges.
+    """Return obliqueness (H, W) and normals (H, W, 3), NaN at edges, of the planes in a depth image (H, W).
 
     The obliqueness is the distance from the plane for a depth that is 1 m too large; 1 at edges.
     """
@@ -249,7 +249,7 @@ def planes_of(
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         normal /= length
         oblique = w / length[..., 0]
-    # Along an edge neither of two surfaces is meant.
+    # Along an edge the point belongs to neither of the two surfaces.
     normal[bent | ~np.isfinite(oblique)] = np.nan
     oblique = np.where(np.isfinite(normal[..., 0]), oblique, 1.0)
     return oblique.astype(np.float32), normal.astype(np.float32)
@@ -269,7 +269,7 @@ def _median_mm(distances_m: NDArray[np.float32], scale_m: NDArray[np.float32]) -
 
 
 def median_depth_m(frames: Sequence[NDArray[np.uint16]], depth_scale_m: float) -> NDArray[np.float32]:
-    """Median (H, W) in metres over frames; NaN where fewer than half of them measured anything."""
+    """Return the median (H, W) in metres over frames; NaN if fewer than half of them measured the pixel."""
     stack = np.stack(frames).astype(np.float32)
     stack[stack == 0.0] = np.nan
     measured = np.isfinite(stack).sum(axis=0)

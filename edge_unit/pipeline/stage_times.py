@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long a frame spends in each stage of the method."""
+"""Time that a frame spends in each stage of the method."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class StageTimes:
-    """Nanoseconds that a frame spent in each stage; foreground and voxels are one sweep over the picture."""
+    """Nanoseconds that a frame spent in each stage; foreground and voxels are one pass over the image."""
 
     expected_ns: int = 0
     foreground_ns: int = 0
@@ -26,12 +26,12 @@ class StageTimes:
 
     @property
     def total_ns(self) -> int:
-        """All stages together."""
+        """The sum of all stages."""
         return sum(vars(self).values())
 
 
 class StageRunner:
-    """Runs the stages of one frame and notes how long each took."""
+    """Runs the stages of one frame and measures the time of each."""
 
     def __init__(self) -> None:
         self._took_ns: dict[str, int] = {}
@@ -43,12 +43,12 @@ class StageRunner:
         *arguments: Arguments.args,
         **named: Arguments.kwargs,
     ) -> Result:
-        """Return what `function` returns; `stage` is a name of `StageTimes`, without the unit."""
+        """Call `function` and return its result; `stage` is a name of `StageTimes`, without the unit."""
         started_ns = stage_ns()
         result = function(*arguments, **named)
         self._took_ns[f"{stage}_ns"] = stage_ns() - started_ns
         return result
 
     def times(self) -> StageTimes:
-        """Return what was noted; stages that did not run took nothing."""
+        """Return the times; a stage that did not run took 0."""
         return StageTimes(**self._took_ns)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All that stands still before one camera: CAD, known objects and the background model, as the filter compares it."""
+"""All static surfaces before one camera: CAD, known objects and background model, prepared for the filter."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_unit.pipeline.background_model import Reference
+from edge_unit.pipeline.background_model import BackgroundModel
 from edge_unit.pipeline.edge_halo import EdgeHalo
 from edge_unit.pipeline.expected_depth import StaticLayer
 from geometry.kernels import limits
@@ -25,15 +25,15 @@ EDGE_RADIUS_WIDTH_PX = 1280
 
 @dataclass(frozen=True, eq=False)
 class StaticImages:
-    """What a frame is compared with, pixel by pixel (H, W).
+    """The images (H, W) that a frame is compared with, pixel by pixel.
 
     Attributes:
         minimum_raw: the nearest raw depth that counts.
-        room_raw: uint16, how far beyond `minimum_raw` a pixel must be to be explained by what stands still.
-        seen_limit_raw: uint16, up to where a pixel's ray surely passes nothing that stands still.
+            room_raw: uint16, a depth at least this far beyond `minimum_raw` is explained by a static surface.
+        seen_limit_raw: uint16, the depth up to which a pixel's ray surely meets no static surface.
         depth_m: float32, depth of the nearest surface, unpadded; inf where nothing is known.
         depth_raw: uint16, the same in raw units; 0 where nothing is known.
-        standing_raw: uint16, as `depth_raw` without known objects, which may be carried away before anyone tells.
+        standing_raw: uint16, as `depth_raw` without known objects, which may be carried away before it is reported.
     """
 
     minimum_raw: int
@@ -46,18 +46,18 @@ class StaticImages:
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """CAD and known objects, drawn as the camera sees them from where it stands."""
+    """CAD and known objects, drawn from the camera's pose."""
 
     cad: StaticLayer
     objects: StaticLayer
 
     @classmethod
     def of(cls, intrinsics: Intrinsics, cell: Cell, T_world_camera: Transform) -> Bodies:
-        """Draw what the cell knows."""
+        """Draw the cell's bodies."""
         return cls(StaticLayer(intrinsics, cell.static), StaticLayer(intrinsics, cell.objects)).drawn(T_world_camera)
 
     def of_cell(self, cell: Cell, T_world_camera: Transform) -> Bodies:
-        """Return the bodies of another cell; layers that stand where they stood are kept."""
+        """Return the bodies of another cell; layers without a moved body are kept."""
         return Bodies(self.cad.of(cell.static), self.objects.of(cell.objects)).drawn(T_world_camera)
 
     def drawn(self, T_world_camera: Transform) -> Bodies:
@@ -77,14 +77,14 @@ class Bodies:
 
 
 class StaticModel:
-    """What stands still before one camera.
+    """The static surfaces before one camera.
 
     Attributes:
         bodies: CAD and known objects.
-        reference: the background model; None while nothing was learned.
-        images: what a frame is compared with.
-        halo: what edges of the CAD make the camera see beside them.
-        version: rises whenever any of these changes.
+        reference: the background model; None if there is none.
+        images: the images that a frame is compared with.
+        halo: the false depths beside edges of the CAD.
+        version: rises with each change of these.
     """
 
     def __init__(self, intrinsics: Intrinsics, bodies: Bodies, settings: FilterSettings) -> None:
@@ -96,21 +96,21 @@ class StaticModel:
         self._room_raw = np.empty(intrinsics.shape, np.uint16)
         self._scratch_raw = np.empty((2, *intrinsics.shape), np.uint16)
         self.bodies = bodies
-        self.reference: Reference | None = None
+        self.reference: BackgroundModel | None = None
         self.halo = EdgeHalo(intrinsics)
         self.version = 0
         self.images = self._renewed()
 
     def change(self, bodies: Bodies, settings: FilterSettings) -> None:
-        """Take other bodies, or the same drawn from elsewhere, and other settings."""
+        """Use other bodies, or the same for another pose of the camera, and other settings."""
         self.bodies, self._settings = bodies, settings
         self.images = self._renewed()
 
-    def use(self, reference: Reference | None) -> None:
-        """Make `reference` part of the model; None takes it out.
+    def use(self, reference: BackgroundModel | None) -> None:
+        """Make `reference` part of the model; None removes it.
 
         Raises:
-            InputError: it was learned by a camera of another resolution; the old one stays.
+            InputError: it is of another resolution; the old one stays.
         """
         if reference is not None and reference.depth_m.shape != self._intrinsics.shape:
             raise InputError(
@@ -120,7 +120,7 @@ class StaticModel:
         self.images = self._renewed()
 
     def _renewed(self) -> StaticImages:
-        """Limits of all that stands still, less margins, nearest over the blur of an edge."""
+        """Compute the limits of all static surfaces, less margins, as the minimum over the blur of an edge."""
         settings, camera = self._settings, self._intrinsics
         w = self.bodies.nearest_w
         learned = self.reference

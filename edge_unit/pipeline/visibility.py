@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which blocks of the cell the camera looks through now; all else is unseen."""
+"""Blocks of the cell that the camera looks through now; all else is unseen."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from shared.lattice import Lattice, block_lattice
 from shared.transforms import Transform, inverse
 
 ROWS_LOOKED_AT = 360
-"""Of a larger image only every second row is looked at, or every third: a block of 100 mm is 16 rows at 4 m."""
+"""Of a larger image only every second row is used, or every third: a block of 100 mm is 16 rows at 4 m."""
 
 EDGE_SHARE = 1e-3
-"""Of a voxel: how far inside of its faces it is looked at, so that rounding counts no neighbour."""
+"""Part of a voxel: the inset of the probed points from its faces, so that rounding counts no neighbour."""
 
 SIGMAS = 2.0
-"""Standard deviations of depth by which a ray must be measured behind a block; obstacles in it then show."""
+"""Standard deviations of depth by which a ray must end behind a block; an obstacle in the block then shows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class SeenBlocks:
     lattice: Lattice
 
     def coarser(self) -> SeenBlocks:
-        """Blocks of twice the edge, seen only where all of their parts are; parts beyond the box do not count."""
+        """Return blocks of twice the edge, seen only if all of their parts are; parts beyond the box do not count."""
         nx, ny, nz = self.lattice.shape
         shape = ((nx + 1) // 2, (ny + 1) // 2, (nz + 1) // 2)
         padded = np.ones((2 * shape[0], 2 * shape[1], 2 * shape[2]), np.uint8)
@@ -46,12 +46,12 @@ class SeenBlocks:
         return SeenBlocks(parts.min(axis=(1, 3, 5)).reshape(-1), larger)
 
     def without(self, voxels: Voxels) -> SeenBlocks:
-        """The same but for the blocks that any of the `voxels` reaches into."""
+        """Return the same without the blocks that any of the `voxels` overlaps."""
         size_m, block_m = voxels.lattice.voxel_size_m, self.lattice.voxel_size_m
         low_m = voxels.lattice.centres(voxels.indices) - 0.5 * size_m
         seen = self.seen.copy()
         grid = seen.reshape(self.lattice.shape)
-        # Along each axis no block between the first and the last is stepped over.
+        # Along each axis no block between the first and the last is left out.
         inward = EDGE_SHARE * size_m
         steps_m = np.linspace(inward, size_m - inward, int(np.ceil(size_m / block_m)) + 1)
         for step_m in itertools.product(steps_m, repeat=3):
@@ -61,12 +61,12 @@ class SeenBlocks:
         return SeenBlocks(seen, self.lattice)
 
     def packed(self) -> bytes:
-        """One bit a block, the first block in the lowest bit."""
+        """Return one bit for each block, the first block in the lowest bit."""
         return np.packbits(self.seen, bitorder="little").tobytes()
 
 
 class Visibility:
-    """Probes the blocks of a cell as one camera sees them."""
+    """Probes the blocks of a cell from one camera's pose."""
 
     def __init__(
         self,
@@ -78,9 +78,9 @@ class Visibility:
         share_min: float,
         noise_per_m: float,
     ) -> None:
-        """A block is seen where at least `share_min` of its rays pass through it.
+        """A block is seen if at least `share_min` of its rays pass through it.
 
-        `noise_per_m` is the `c` of the camera's `sigma(z) = c * z**2`.
+        `noise_per_m` is `c` of the camera's `sigma(z) = c * z**2`.
         """
         self.lattice = block_lattice(box_min_m, box_max_m, block_size_m)
         self._intrinsics = intrinsics
@@ -95,7 +95,7 @@ class Visibility:
         self.place(T_world_camera)
 
     def place(self, T_world_camera: Transform) -> None:
-        """The camera stands elsewhere from now on."""
+        """Use another pose of the camera from now on."""
         camera, lattice = self._intrinsics, self.lattice
         blocks = kernels.Blocks(np.array(lattice.shape, np.int32), lattice.voxel_size_m, np.array(lattice.origin_m))
         measuring = kernels.Measuring(NEAR_PLANE_M, self._noise_per_m, camera.depth_scale_m)
@@ -103,13 +103,13 @@ class Visibility:
             plain(blocks), inverse(T_world_camera), camera_of(camera), plain(measuring), self._views
         )
 
-    def look(
+    def find_seen(
         self,
         depth_raw: NDArray[np.uint16],
         static_limit_raw: NDArray[np.uint16],
         robot_near_raw: NDArray[np.uint16],
     ) -> SeenBlocks:
-        """The blocks that a frame looks through; images (H, W)."""
+        """Return the blocks that a frame looks through; images (H, W)."""
         kernels.seen_blocks(
             depth_raw,
             static_limit_raw,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Foreground pixels become voxels of the cell's lattice (Algorithms 1, 6 and 7)."""
+"""Turns foreground pixels into voxels of the cell's lattice (Algorithms 1, 6 and 7)."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Voxels:
     """Obstacle voxels of one frame.
 
     Attributes:
-        keys: (N,) uint32, ascending, as `Lattice.keys` has them.
-        counts: (N,) uint32, the foreground pixels that fell into each.
-        lattice: on which they lie.
+        keys: (N,) uint32, ascending, in the order of `Lattice.keys`.
+        counts: (N,) uint32, the number of foreground pixels in each.
+        lattice: the lattice of the keys.
     """
 
     keys: NDArray[np.uint32]
@@ -36,14 +36,14 @@ class Voxels:
 
     @property
     def indices(self) -> NDArray[np.int16]:
-        """(N, 3) int16."""
+        """Lattice indices (N, 3) int16."""
         return self.lattice.indices(self.keys)
 
     def __len__(self) -> int:
         return len(self.keys)
 
     def nearest(self, position_m: NDArray[np.float64], most: int) -> tuple[Voxels, Voxels]:
-        """At most so many of them, those nearest to a place (3,) of the world, and the others."""
+        """Return at most so many of them, nearest to a point (3,) of the world, and the others."""
         distance_m = np.linalg.norm(self.lattice.centres(self.indices) - position_m, axis=1)
         chosen = np.zeros(len(self), np.bool_)
         chosen[np.argsort(distance_m, kind="stable")[:most]] = True
@@ -54,7 +54,7 @@ class Voxels:
 
 
 class Voxelizer:
-    """Counts points on a lattice as one camera sees it; its memory is taken once, for the worst frame."""
+    """Counts points on the lattice for one camera; its memory is allocated once, for the worst frame."""
 
     def __init__(
         self, intrinsics: Intrinsics, T_world_camera: Transform, lattice: Lattice, settings: FilterSettings
@@ -65,7 +65,7 @@ class Voxelizer:
         self._shape = np.array(lattice.shape, np.int32)
         self._counts = np.zeros(int(np.prod(self._shape + 2, dtype=np.int64)) + 1, np.uint32)
         stride = -(-intrinsics.width // voxelize.PIXELS_PER_WORD) * voxelize.PIXELS_PER_WORD
-        # Behind the picture's last column it stays zero.
+        # The column behind the image's last one stays zero.
         mask = np.zeros((points.ROWS_AT_ONCE, stride), np.uint8)
         self._mask = plain(voxelize.Mask(mask.view(np.uint64), mask))
         self._touched = np.empty(most + 1, np.uint32)
@@ -87,7 +87,7 @@ class Voxelizer:
         self.place(T_world_camera)
 
     def place(self, T_world_camera: Transform) -> None:
-        """The camera stands elsewhere from now on."""
+        """Use another pose of the camera from now on."""
         camera, lattice = self._intrinsics, self.lattice
         voxels_per_m = T_world_camera[:3, :3] / lattice.voxel_size_m
         per_raw = voxels_per_m * camera.depth_scale_m
@@ -139,7 +139,7 @@ class Voxelizer:
         robot: RobotLayer,
         halo: EdgeHalo,
     ) -> int:
-        """Count the foreground on the lattice; returns how many voxels hold any."""
+        """Count the foreground on the lattice; returns the number of voxels that hold any."""
         return points.count_foreground(
             depth_raw,
             room_raw,
@@ -152,8 +152,8 @@ class Voxelizer:
         )
 
     def _keep_dense(self, found: int) -> Voxels:
-        """Return the voxels that hold enough points, and forget all `found` of them."""
-        # In the order of memory: judging them is then several times as fast, and the kept ones come sorted.
+        """Return the voxels that hold enough points, and reset all `found` counts."""
+        # In the order of memory: it is several times as fast, and the voxels come out sorted.
         self._touched[:found].sort()
         kept = density.keep_dense(self._counts, self._touched, found, self._view, self._rule, self._judged)
         voxelize.forget(self._counts, self._touched, found)

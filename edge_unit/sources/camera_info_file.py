@@ -100,7 +100,7 @@ def read_camera_info(path: Path, image_shape: tuple[int, int]) -> Pinhole:
     except ValidationError as error:
         raise SourceError(f"{path}: {sentence(error)}") from error
     except yaml.YAMLError as error:
-        raise SourceError(f"{path}: no YAML: {' '.join(str(error).split())}") from error
+        raise SourceError(f"{path}: expected YAML: {' '.join(str(error).split())}") from error
     except RecursionError as error:
         raise SourceError(f"{path}: expected values in a few levels, got them nested too deeply") from error
     except OSError as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame, a camera's identity, and what every source can do."""
+"""A frame, a camera's identity, and the interface of every source."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from shared.transforms import Transform
 class DepthFrame:
     """One depth image.
 
-    `depth` (H, W) uint16 in units of `depth_scale_m`, 0 where nothing was measured; it may lie in memory that the
-    source uses again, so copy what is to be kept beyond the next frame. `captured_at_ns` is CLOCK_MONOTONIC of this
-    unit at the middle of the exposure. `frame_number` rises; a gap means that frames were dropped. `joints` (n,) rad
-    only where a data set carries them.
+    `depth` (H, W) uint16 in units of `depth_scale_m`, 0 where nothing was measured. The source may reuse its memory:
+    copy it to keep it beyond the next frame. `captured_at_ns` is CLOCK_MONOTONIC of this unit at the middle of the
+    exposure. `frame_number` rises; a gap means that frames were dropped. `joints` (n,) rad only if a data set carries
+    them.
     """
 
     depth: NDArray[np.uint16]
@@ -32,7 +32,7 @@ class DepthFrame:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """Who the camera is: `serial` tells it from all others; `T_world_camera` only where the source knows its pose."""
+    """A camera's identity: `serial` is unique; `T_world_camera` only if the source knows its pose."""
 
     serial: str
     model: str
@@ -47,12 +47,12 @@ class DepthSource(Protocol):
         """Start the camera.
 
         Raises:
-            SourceError: it is not there, or does not start; the text says what to do.
+            SourceError: it is absent, or does not start; the text says what to do.
         """
         ...
 
     def frames(self) -> AsyncGenerator[DepthFrame, None]:
-        """Frames as they come, latest wins: a slow reader skips, it never lags. Ends where a recording ends.
+        """Yield frames as they come, latest-only: a slow reader skips frames, and never lags. Ends with a recording.
 
         Raises:
             SourceError: the camera stopped delivering.
@@ -60,5 +60,5 @@ class DepthSource(Protocol):
         ...
 
     async def close(self) -> None:
-        """Stop the camera and release it; harmless when it is not open."""
+        """Stop the camera and release it; no effect if it is not open."""
         ...

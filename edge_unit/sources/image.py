@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture that is not depth: what finds the calibration board, and how it lies to the depth image."""
+"""Images other than depth, for the calibration board, with their geometry relative to the depth image."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from shared.camera import Intrinsics
 from shared.transforms import Transform
 
 ImageStream = Literal["infrared", "color"]
-"""`infrared` is the left imager, in which the depth image lies; `color` has a lens and a place of its own."""
+"""`infrared` is the left imager, the frame of the depth image; `color` has a lens and a pose of its own."""
 
 
 @dataclass(frozen=True)
 class ImageInfo:
-    """The lens of an image stream, and where it stands.
+    """The lens of an image stream, and its pose.
 
     `distortion` (5,) is k1, k2, p1, p2, k3 of `distortion_model`; all zero for a rectified image. `T_depth_image` maps
     points of this stream's optical frame into the depth camera's.
@@ -35,9 +35,9 @@ class ImageInfo:
 
 @dataclass(frozen=True)
 class ImageFrame:
-    """One picture: `pixels` (H, W) uint8 for infrared, (H, W, 3) uint8 RGB for colour.
+    """One image: `pixels` (H, W) uint8 for infrared, (H, W, 3) uint8 RGB for colour.
 
-    Valid until the next one is delivered; copy what is to be kept. `captured_at_ns` is CLOCK_MONOTONIC.
+    Valid until the next one is delivered; copy it to keep it. `captured_at_ns` is CLOCK_MONOTONIC.
     """
 
     pixels: NDArray[np.uint8]
@@ -45,16 +45,16 @@ class ImageFrame:
     frame_number: int
 
 
-class ImageLook(Protocol):
-    """Pictures of one image stream, while depth pauses."""
+class ImageFeed(Protocol):
+    """Images of one stream, while depth is paused."""
 
     @property
     def info(self) -> ImageInfo:
-        """The stream's lens, and where it stands."""
+        """The stream's lens and pose."""
         ...
 
     def images(self) -> AsyncGenerator[ImageFrame, None]:
-        """Pictures as they come, latest wins.
+        """Yield images as they come, latest-only.
 
         Raises:
             SourceError: the camera will deliver no more.
@@ -63,13 +63,13 @@ class ImageLook(Protocol):
 
 
 @runtime_checkable
-class LooksAtBoard(Protocol):
-    """A source that can deliver pictures of another stream, the emitter off, for as long as the context lasts."""
+class ImageSource(Protocol):
+    """A source that can deliver images of another stream, with the emitter off, within the context."""
 
-    def look(self, stream: ImageStream) -> AbstractAsyncContextManager[ImageLook]:
-        """Pause depth and begin; depth goes on afterwards by itself.
+    def open_images(self, stream: ImageStream) -> AbstractAsyncContextManager[ImageFeed]:
+        """Pause depth and deliver images; depth resumes at the end of the context.
 
         Raises:
-            SourceError: it is not open, or has no such stream.
+            SourceError: the source is not open, or has no such stream.
         """
         ...

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of depth images played as if a camera took them now.
+"""A folder of depth images, played as if a camera took them now.
 
-Every frame is delivered once, in order, however slow the reader: a recording is for looking closely, and unlike a
-camera it can wait. Capture times are those of the delivery.
+Every frame is delivered once, in order, to a reader of any speed: a recording is for close examination and, unlike a
+camera, can wait. Capture times are the times of delivery.
 """
 
 from __future__ import annotations
@@ -40,26 +40,26 @@ IMAGE_SUFFIXES = (".png", ".tif", ".tiff")
 SUFFIXES = (*IMAGE_SUFFIXES, ".npz", ".npy")
 
 NPZ_NAME = "depth"
-"""The array in an npz; any name will do when it is the only one."""
+"""Name of the array in an npz; a single array may have any name."""
 
 SERIAL_NAME_CHARS = 64
-"""Of the folder's name in a serial: enough to recognise it, well within what a master takes."""
+"""Part of the folder's name in a serial: enough to recognise it, well within a master's limit."""
 
 SERIAL_HASH_CHARS = 8
-"""32 bits: among the units of a cell no two recordings share them by chance."""
+"""32 bits: two recordings in one cell do not share them by chance."""
 
 MAX_FILE_BYTES = 256 * 2**20
-"""Of one image: many times the largest camera's, so that a wrong file does not fill the memory."""
+"""Limit of one image file: many times the largest camera's, so that a wrong file does not fill the memory."""
 
 
 MAX_FRAMES = 100_000
-"""Of a recording, named one by one; two hours at 15 fps."""
+"""Limit of frames of a recording, named one by one; two hours at 15 fps."""
 
 DEPTH_MAX_M = 200.0
 """Of an image in metres: farther than any depth camera measures, and nearer than a wall is in millimetres."""
 
 ExpandedPath = Annotated[Path, BeforeValidator(lambda value: os.path.expandvars(os.path.expanduser(value)))]
-"""May begin with `~` or a variable such as `$CELLWATCH_DATA`."""
+"""May start with `~` or a variable such as `$CELLWATCH_DATA`."""
 
 
 class RecordedSourceConfig(BaseModel):
@@ -70,10 +70,10 @@ class RecordedSourceConfig(BaseModel):
     kind: Literal["recorded"] = "recorded"
     folder: ExpandedPath = Field(description="With `depth/` (or the images themselves) and `camera_info.yaml`.")
     frames: tuple[str | int, ...] | None = Field(
-        default=None, max_length=MAX_FRAMES, description="Names or numbers, in the order to be played; absent: all."
+        default=None, max_length=MAX_FRAMES, description="Names or numbers, in the order of play; absent: all."
     )
-    fps: float | None = Field(default=None, gt=0.0, le=300.0, description="Absent: as fast as they are taken.")
-    loop: bool = Field(default=False, description="Begin again at the end.")
+    fps: float | None = Field(default=None, gt=0.0, le=300.0, description="Absent: as fast as the reader takes them.")
+    loop: bool = Field(default=False, description="Start again at the end.")
     depth_scale_m: float = Field(default=0.001, ge=1e-6, le=0.1)
     fx_stereo: float | None = Field(default=None, gt=0.0, description="Focal length at which the imagers match.")
     stereo_baseline_m: float = Field(default=D435_BASELINE_M, ge=0.005, le=1.0)
@@ -102,23 +102,23 @@ class RecordedSource:
         self._recording: _Recording | None = None
 
     async def open(self) -> CameraInfo:
-        """Look at the folder.
+        """Read the folder's index.
 
         Raises:
-            SourceError: something is missing or malformed; names the file.
+            SourceError: a file is missing or malformed; the text names it.
         """
         self._recording = await asyncio.to_thread(_open, self._config)
         return self._recording.info
 
     async def frames(self) -> AsyncGenerator[DepthFrame, None]:
-        """The frames in order, at the configured rate; ends at the end unless it loops.
+        """Yield the frames in order, at the configured rate; stops at the end unless it loops.
 
         Raises:
-            SourceError: it is not open, or an image cannot be read or does not fit.
+            SourceError: the source is not open, or an image cannot be read or does not fit.
         """
         recording = self._recording
         if recording is None:
-            raise SourceError(f"{self._config.folder}: frames were asked for before it was opened")
+            raise SourceError(f"{self._config.folder}: expected an open source before frames are read: call open first")
         period_ns = 0 if self._config.fps is None else round(NS_PER_S / self._config.fps)
         number, due_ns = 0, monotonic_ns()
         while True:
@@ -129,13 +129,13 @@ class RecordedSource:
                 captured_at_ns = monotonic_ns()
                 yield DepthFrame(depth, captured_at_ns, number, joints)
                 number += 1
-                # A reader that was late does not make the frames behind it hurry.
+                # A late reader does not speed up the following frames.
                 due_ns = max(due_ns + period_ns, captured_at_ns)
             if not self._config.loop:
                 return
 
     async def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: no resource is held."""
         self._recording = None
 
 
@@ -143,7 +143,7 @@ def read_pose(path: Path) -> Transform:
     """Read `T_world_camera` from a text file: a 4x4 matrix, its first three rows, or all 16 numbers in one row.
 
     Raises:
-        ConfigError: it cannot be read, or holds no rigid transform; names the file.
+        ConfigError: it cannot be read, or is not a rigid transform; the text names the file.
     """
     try:
         matrix = parse_numbers(read_text(path))
@@ -160,10 +160,10 @@ def read_pose(path: Path) -> Transform:
 
 
 def open_recording(config: RecordedSourceConfig) -> CameraInfo:
-    """The camera of a recording, without its frames.
+    """Read the camera of a recording, without its frames.
 
     Raises:
-        SourceError: something is missing or malformed; names the file.
+        SourceError: a file is missing or malformed; the text names it.
     """
     return _open(config).info
 
@@ -194,19 +194,19 @@ def _open(config: RecordedSourceConfig) -> _Recording:
 
 
 def _serial(folder: Path) -> str:
-    """Of a recording without one: two folders of the same name are two cameras."""
+    """Make a serial for a recording without one: two folders of the same name are two cameras."""
     path = folder.resolve()
     name = "".join(char if char.isprintable() else "_" for char in path.name)[:SERIAL_NAME_CHARS]
     return f"{name}-{hashlib.sha256(os.fsencode(path)).hexdigest()[:SERIAL_HASH_CHARS]}"
 
 
 def _place(path: Path) -> list[str | int]:
-    """Sorts frame 10 after frame 9."""
+    """Sort key that puts frame 10 after frame 9."""
     return [int(part) if part.isdigit() else part for part in re.split(r"([0-9]+)", path.name)]
 
 
 def _named(images: Path, every: list[Path], name: str | int) -> Path:
-    """The file of that stem, or the one at that place."""
+    """Return the file with that stem, or the one at that index."""
     for file in every:
         if str(name) in (file.stem, file.name):
             return file
@@ -235,7 +235,7 @@ def _intrinsics(path: Path, first: Path, config: RecordedSourceConfig) -> Intrin
 
 
 def _joints(path: Path, frame_count: int) -> NDArray[np.float64]:
-    """Joint positions (frames, n)."""
+    """Read joint positions (frames, n)."""
     try:
         rows = parse_numbers(read_text(path))
     except (OSError, ValueError) as error:
@@ -292,9 +292,9 @@ def _decoded(path: Path) -> NDArray[Any]:
         encoded = np.fromfile(path, dtype=np.uint8)
         image = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if encoded.size else None
         if image is None:
-            raise SourceError(f"{path}: no image that can be read")
+            raise SourceError(f"{path}: expected an image, got another file")
         return image
-    # Read here, for numpy leaves a broken file open.
+    # Read here, since numpy leaves a broken file open.
     loaded = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
     if isinstance(loaded, np.ndarray):
         return loaded

@@ -89,8 +89,8 @@ class FrameObserver(Protocol):
         ...
 
 
-class SimulatedLook:
-    """Images of the board as the simulated camera takes them; an `ImageLook`."""
+class SimulatedImages:
+    """Images of the board as the simulated camera takes them; an `ImageFeed`."""
 
     def __init__(self, camera: BoardCamera, hands: Hands, worker: ThreadPoolExecutor, epoch_ns: int) -> None:
         self._camera = camera
@@ -100,13 +100,13 @@ class SimulatedLook:
 
     @property
     def info(self) -> ImageInfo:
-        """See `ImageLook`."""
+        """See `ImageFeed`."""
         return ImageInfo(
             self._camera.stream, self._camera.intrinsics, (0.0,) * 5, "brown_conrady", self._camera.T_depth_image
         )
 
     async def images(self) -> AsyncGenerator[ImageFrame, None]:
-        """See `ImageLook`. The camera takes an image whenever the caller requests the next one."""
+        """See `ImageFeed`. The camera takes an image whenever the caller requests the next one."""
         loop = asyncio.get_running_loop()
         for number in itertools.count():
             now_ns = monotonic_ns()
@@ -172,14 +172,14 @@ class SimulatedSource:
             yield DepthFrame(frame.depth, due_ns, number)
 
     @asynccontextmanager
-    async def look(self, stream: ImageStream) -> AsyncIterator[SimulatedLook]:
-        """See `LooksAtBoard`."""
+    async def open_images(self, stream: ImageStream) -> AsyncIterator[SimulatedImages]:
+        """See `ImageSource`."""
         worker = self._worker
         if worker is None:
             raise SourceError("simulated camera: expected to be opened before its images are read")
         camera = await asyncio.get_running_loop().run_in_executor(worker, self._board_camera, stream)
         assert self._hands is not None
-        yield SimulatedLook(camera, self._hands, worker, self._config.epoch_ns)
+        yield SimulatedImages(camera, self._hands, worker, self._config.epoch_ns)
 
     async def close(self) -> None:
         """See `DepthSource`."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a source is doing, told at once and without a frame: the master must not wait for a picture to learn of it."""
+"""The status of a source, reported at once: the master need not wait for a frame to know it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from shared.clock import monotonic_ns
 SourceState = Literal["closed", "starting", "absent", "live", "silent", "restarting", "looking", "ended", "failed"]
 """
 closed      not open
-starting    the camera is there and is being started
-absent      the wanted camera is not there
+starting    the camera is connected and starts
+absent      the configured camera is not connected
 live        frames come
-silent      it runs, but no frame came for longer than it should take
-restarting  capture failed and is begun anew
-looking     it delivers pictures for calibration, and no depth meanwhile
-ended       a recording has come to its end
+silent      it runs, but no frame came for longer than expected
+restarting  capture failed and restarts
+looking     it delivers images for calibration, and no depth meanwhile
+ended       a recording has ended
 failed      it will not recover by itself
 """
 
@@ -27,7 +27,7 @@ UNTROUBLED: frozenset[SourceState] = frozenset({"live", "ended", "closed"})
 
 @dataclass(frozen=True)
 class SourceStatus:
-    """A state, why, since when (CLOCK_MONOTONIC), and what is worse than it need be although frames come."""
+    """A state, its reason, its start (CLOCK_MONOTONIC), and a warning if frames come with a defect."""
 
     state: SourceState
     reason: str = ""
@@ -36,7 +36,7 @@ class SourceStatus:
 
     @property
     def trouble(self) -> str | None:
-        """Why there are no frames, in one sentence; None when there are, or when nobody wants any."""
+        """The reason for which there are no frames, in one sentence; None if there are, or if none are requested."""
         if self.state in UNTROUBLED:
             return None
         return f"camera {self.state}: {self.reason}" if self.reason else f"camera {self.state}"
@@ -44,15 +44,15 @@ class SourceStatus:
 
 @runtime_checkable
 class ReportsStatus(Protocol):
-    """A source that tells how it is doing."""
+    """A source that reports its status."""
 
     @property
     def status(self) -> SourceStatus:
-        """How it is doing now."""
+        """The current status."""
         ...
 
     async def next_status(self, known: SourceStatus) -> SourceStatus:
-        """Wait until the status is another than `known`, and return it."""
+        """Wait until the status differs from `known`, and return it."""
         ...
 
 
@@ -64,7 +64,7 @@ class StatusBoard:
         self._changed = asyncio.Event()
 
     def post(self, state: SourceState, reason: str = "", warning: str = "") -> None:
-        """Make this the status, unless it is already."""
+        """Set the status, if it differs."""
         if (state, reason, warning) == (self.now.state, self.now.reason, self.now.warning):
             return
         self.now = SourceStatus(state, reason, warning, monotonic_ns())
@@ -72,7 +72,7 @@ class StatusBoard:
         self._changed = asyncio.Event()
 
     async def next(self, known: SourceStatus) -> SourceStatus:
-        """Wait until the status is another than `known`, and return it."""
+        """Wait until the status differs from `known`, and return it."""
         while self.now == known:
             await self._changed.wait()
         return self.now

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `make faults` breaks, and who watches the map meanwhile.
+"""Processes that `make faults` breaks, and the observers of the map.
 
 In the order of the flow:
 
-    scene  what stands before the cameras of the fault table, and which blocks it fills
-    unit   the edge unit before a camera whose picture may be exchanged
-    clock  other clocks for one process
-    watch  asks for the map all the time, and holds the answers against the truth
-    site   a master, two units and a robot, and all that may be done to them
+    scene  the view of both cameras, and the blocks that its things fill
+    unit   the edge unit with a camera whose image can be exchanged
+    clock  separate clocks for one process
+    watch  polls the map all the time, and compares the answers with the truth
+    site   a master, two units and a robot, and all actions on them
 """

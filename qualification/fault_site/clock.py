@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Other clocks for one process: a wall clock that jumps while it runs, a monotonic clock that began elsewhere."""
+"""Separate clocks for one process: a wall clock that jumps while it runs, and a monotonic clock with another origin."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ time_t time(time_t *at) {
 
 
 class WallClock:
-    """The wall clock of the processes that are started with `environment`; it jumps when told to."""
+    """Wall clock of the processes that are started with `environment`. It can jump."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises ConfigError where there is no C compiler."""
+        """Compile the library. Raises ConfigError if there is no C compiler."""
         compiler = shutil.which("cc")
         if compiler is None:
-            raise ConfigError("wall clock: expected a C compiler named cc, by which one process gets its own clock")
+            raise ConfigError("wall clock: expected a C compiler named cc, found none; install one (package gcc)")
         folder.mkdir()
         library, self._file = folder / "wall_clock.so", folder / "offset"
         source = folder / "wall_clock.c"
@@ -80,11 +80,11 @@ class WallClock:
         self.environment = {"LD_PRELOAD": str(library), OFFSET_FILE: str(self._file)}
 
     def jump(self, by_s: int) -> None:
-        """From now on it is this far off."""
+        """Set the offset of the clock in seconds."""
         with self._file.open("r+b", buffering=0) as file:
             file.write(struct.pack("=q", by_s))
 
 
 def monotonic_elsewhere(by_s: int) -> tuple[str, ...]:
-    """The beginning of a command whose CLOCK_MONOTONIC is this far ahead."""
+    """Return the start of a command whose CLOCK_MONOTONIC is this far ahead."""
     return ("unshare", "--time", f"--monotonic={by_s}", "--fork", "--kill-child=KILL", "--")

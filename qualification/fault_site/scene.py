@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands before the two cameras of the fault table, and which blocks of the cell it fills.
+"""Scene of the fault table: the view of its two cameras, and the blocks of the cell that its things fill.
 
-Two cameras side by side look along +y through a flat cell; their views do not overlap, so what one of them shows
-nobody else can see.
+Two cameras side by side look along +y through a flat cell. Their views do not overlap, so nobody else sees the view of
+either camera.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import yaml
 from numpy.typing import NDArray
 
 WIDTH, HEIGHT, FOCAL_PX = 160, 120, 300.0
-"""Small and of a narrow view: two units, a master and whoever watches them share two cores."""
+"""Small images and a narrow view, because two units, a master and the observers share two cores."""
 
 FPS = 15.0
 
@@ -27,22 +27,22 @@ BOX_MIN_M, BOX_MAX_M = (0.0, 0.0, 0.2), (2.1, 0.6, 0.8)
 CAMERAS_M = ((0.55, -1.5, 0.5), (1.55, -1.5, 0.5))
 
 RPY_DEG = (-90.0, 0.0, 0.0)
-"""Looking along +y."""
+"""Orientation of a camera that looks along +y."""
 
 T_WORLD_CAMERA = tuple(
     ((1.0, 0.0, 0.0, x), (0.0, 0.0, 1.0, y), (0.0, -1.0, 0.0, z), (0.0, 0.0, 0.0, 1.0)) for x, y, z in CAMERAS_M
 )
 
 WALL_MM = 5000
-"""Behind the cell, and in no CAD."""
+"""Depth of the wall behind the cell. It is in no CAD."""
 
 THING_MM = 1775
-"""In the middle of a voxel."""
+"""Depth of a thing, in the middle of a voxel."""
 
 CELL: dict[str, Any] = {
     "name": "faults",
     "box": {"min": list(BOX_MIN_M), "max": list(BOX_MAX_M)},
-    # It stands behind the wall: what counts is that the cell has one, and that it reports.
+    # The robot stands behind the wall. The cell only has to have one, which reports its joints.
     "robot": {
         "dh": {"joints": [{"link": {"box": [0.1, 0.1, 0.1]}}, *({} for _ in range(5))]},
         "pose": {"xyz": [1.0, 8.0, 0.0]},
@@ -52,7 +52,7 @@ CELL: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Thing:
-    """A flat thing that no model knows, as pixels of one camera."""
+    """A flat thing that no model contains, as pixels of one camera."""
 
     name: str
     camera: int
@@ -60,7 +60,9 @@ class Thing:
     rows: tuple[int, int] = (30, 90)
 
     def blocks(self, origin_m: NDArray[np.float64], size_m: float) -> NDArray[np.int64]:
-        """Indices (N, 3) of the blocks that it crosses from edge to edge; those that it only touches do not count."""
+        """Return the indices (N, 3) of the blocks that it crosses from edge to edge. Blocks that it only touches do not
+        count.
+        """
         x, y, z = CAMERAS_M[self.camera]
         left, right = (x + (column - 0.5 - (WIDTH - 1) / 2) * THING_MM / 1000 / FOCAL_PX for column in self.columns)
         top, bottom = (z - (row - 0.5 - (HEIGHT - 1) / 2) * THING_MM / 1000 / FOCAL_PX for row in self.rows)
@@ -71,21 +73,21 @@ class Thing:
 
 
 RESIDENTS = (Thing("resident of camera 1", 0, (15, 65)), Thing("resident of camera 2", 1, (15, 65)))
-"""There from the beginning."""
+"""Things that stand in the cell from the beginning."""
 
 NEWCOMER = Thing("newcomer", 0, (95, 145))
-"""Comes right behind the cause of each fault, where only the unit in trouble could have seen it."""
+"""Appears immediately after the cause of each fault, in the view of only the affected unit."""
 
 
 def write_cell(folder: Path) -> Path:
-    """The cell's file."""
+    """Write the cell's file and return its path."""
     path = folder / "cell.yaml"
     path.write_text(yaml.safe_dump(CELL))
     return path
 
 
 def write_camera(folder: Path, camera: int) -> Path:
-    """A folder in which the picture of one camera lies, with its resident."""
+    """Write the image folder of one camera, with its resident, and return its path."""
     folder.mkdir()
     k = [FOCAL_PX, 0.0, (WIDTH - 1) / 2, 0.0, FOCAL_PX, (HEIGHT - 1) / 2, 0.0, 0.0, 1.0]
     (folder / "camera_info.yaml").write_text(yaml.safe_dump({"width": WIDTH, "height": HEIGHT, "k": k}))
@@ -94,7 +96,7 @@ def write_camera(folder: Path, camera: int) -> Path:
 
 
 def show(folder: Path, *things: Thing) -> None:
-    """From the next frame on the camera of this folder sees these, and nothing else."""
+    """Show exactly these things to the camera of this folder, from the next frame on."""
     depth = np.full((HEIGHT, WIDTH), WALL_MM, np.uint16)
     for thing in things:
         depth[slice(*thing.rows), slice(*thing.columns)] = THING_MM

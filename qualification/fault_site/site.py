@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A master, two units and a robot's controller as real processes, and all that may be done to them."""
+"""A master, two units and a robot's controller as real processes, and all actions on them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from qualification.fault_site.scene import (
     write_camera,
     write_cell,
 )
-from qualification.fault_site.watch import SETTLED_S, Asker, Listener, Observer, Present, good
+from qualification.fault_site.watch import SETTLED_S, Observer, Poller, Present, Subscriber, good
 from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, MasterUnreachable
 from simulation.fleet.processes import Child, Processes
@@ -33,27 +33,27 @@ ADDRESSES = ("127.0.0.2", "127.0.0.3")
 SERIALS = ("ONE", "TWO")
 
 START_S = 240.0
-"""For processes to be there on a busy machine, kernels to be compiled included."""
+"""Time limit for processes to start on a busy machine, including the compilation of kernels."""
 
 RETURN_S = 15.0
-"""For a map to be good again; what takes longer has missed its mark anyway."""
+"""Time limit for a complete map to return. A longer time has missed its mark anyway."""
 
-LOOK_S = 0.005
-"""Between looks at a log, or at what the map said."""
+CHECK_S = 0.005
+"""Time between two checks of a log, or of the map's answers."""
 
 SETTING = {"margin_base_m": 0.031}
-"""Acknowledged before each fault; nobody may forget it."""
+"""Setting that is acknowledged before each fault. No process may lose it."""
 
 Found = TypeVar("Found")
 
 
 class FaultError(CellwatchError):
-    """What was to be measured could not be."""
+    """A figure could not be measured."""
 
 
 @dataclass(eq=False)
 class Site:
-    """All that one fault is tried on. `folder` holds configurations, tokens, state, pictures and logs."""
+    """All processes and files of one fault. `folder` holds configurations, tokens, state, images and logs."""
 
     folder: Path
     processes: Processes
@@ -64,8 +64,8 @@ class Site:
     master: Child = field(init=False)
     robot: Child = field(init=False)
     operator: httpx.AsyncClient = field(init=False)
-    asker: Asker = field(init=False)
-    listener: Listener = field(init=False)
+    poller: Poller = field(init=False)
+    subscriber: Subscriber = field(init=False)
     watching: list[Observer] = field(init=False, default_factory=list)
     cameras: list[Path] = field(init=False)
     _starts: int = field(init=False, default=0)
@@ -82,10 +82,10 @@ class Site:
     # ------------------------------------------------------------------ starting
 
     async def start_master(self, variables: Mapping[str, str] | None = None) -> None:
-        """Start it, at the same port as before, and wait until it can be asked.
+        """Start the master, at the same port as before, and wait until it answers.
 
         Raises:
-            FaultError: it ends instead.
+            FaultError: the master ends instead.
         """
         try:
             running = await start_master(
@@ -101,7 +101,7 @@ class Site:
         )
 
     async def start_robot(self) -> None:
-        """Start its controller."""
+        """Start the robot's controller."""
         self.robot = await self.processes.start(
             self._name("robot"), "simulation.fleet.controller",
             *("--url", f"http://127.0.0.1:{self.port}", "--token-file", str(self.operator_token), "--rate", "20"),
@@ -115,7 +115,7 @@ class Site:
         under: Sequence[str] = (),
         variables: Mapping[str, str] | None = None,
     ) -> Child:
-        """Start a unit; without a pose, for the master keeps it."""
+        """Start a unit. It gets no pose, because the master keeps it."""
         if not self.tokens[index].exists():
             self.tokens[index].write_text(self.unit_token.read_text())
         document = {
@@ -135,20 +135,20 @@ class Site:
         return child
 
     async def calm(self) -> None:
-        """Give all cameras their poses, wait until the map is complete and right, and begin to watch it.
+        """Set the poses of all cameras, wait until the map is complete and right, and start the observers.
 
         Raises:
-            FaultError: it does not become so.
+            FaultError: the map does not become complete.
         """
         await until(lambda: all(registered(unit) for unit in self.units), "two registered units")
-        await self.give_poses()
+        await self.set_poses()
         response = await self.operator.put("/settings", json=SETTING)
         response.raise_for_status()
         since_ns = monotonic_ns()
         self.present = [Present(thing, since_ns) for thing in RESIDENTS]
         things = (*RESIDENTS, NEWCOMER)
-        self.asker, self.listener = Asker(self.port, things), Listener(self.port, things)
-        self.watching = [self.asker, self.listener]
+        self.poller, self.subscriber = Poller(self.port, things), Subscriber(self.port, things)
+        self.watching = [self.poller, self.subscriber]
         for observer in self.watching:
             observer.start()
         await self.settled(START_S)
@@ -157,45 +157,45 @@ class Site:
         self._before = await self.acknowledged()
         await asyncio.sleep(SETTLED_S)
 
-    async def look_away(self) -> None:
-        """Have nobody watch any more; harmless when nobody does."""
+    async def stop_observers(self) -> None:
+        """Stop all observers. It may be called again."""
         for observer in self.watching:
             await asyncio.to_thread(observer.stop)
         self.watching = []
 
-    async def give_poses(self) -> None:
-        """Tell the master where each camera stands, as an operator would."""
+    async def set_poses(self) -> None:
+        """Set the pose of each camera, as an operator would."""
         for row in (await self.operator.get("/units")).json():
             pose = T_WORLD_CAMERA[SERIALS.index(row["serial"])]
             answer = await self.operator.put(f"/units/{row['id']}/pose", json={"T_world_camera": pose})
             answer.raise_for_status()
 
-    # ------------------------------------------------------------------ what is done to them
+    # ------------------------------------------------------------------ actions
 
     def newcomer(self) -> None:
-        """Something comes to where only the first unit looks."""
+        """Add a thing that only the first unit can see."""
         show(self.cameras[0], RESIDENTS[0], NEWCOMER)
         self.present.append(Present(NEWCOMER, monotonic_ns()))
 
     async def kill(self, child: Child) -> None:
-        """Kill it, and see it end."""
+        """Kill a process, and wait for its end."""
         child.may_end = True
         child.process.kill()
         await child.process.wait()
 
-    # ------------------------------------------------------------------ what is found
+    # ------------------------------------------------------------------ results
 
     async def settled(self, timeout_s: float = RETURN_S) -> None:
-        """Wait until the map is complete and tells of all that is there, for SETTLED_S on end.
+        """Wait until the map is complete and holds all things for SETTLED_S without interruption.
 
         Raises:
-            FaultError: it does not become so.
+            FaultError: the map does not settle in time.
         """
         names = {present.thing.name for present in self.present}
         began_ns = monotonic_ns()
 
         def look() -> bool:
-            answers = self.asker.answers
+            answers = self.poller.answers
             end_ns = monotonic_ns()
             if end_ns - began_ns < SETTLED_S * NS_PER_S:
                 return False
@@ -203,22 +203,22 @@ class Site:
             return bool(recent) and all(good(answer, names, len(SERIALS)) for answer in recent)
 
         await until(
-            look, "a complete map that tells of all that is there", timeout_s, lambda: f"{self.asker.answers[-1:]}"
+            look, "a complete map that tells of all that is there", timeout_s, lambda: f"{self.poller.answers[-1:]}"
         )
 
     async def acknowledged(self) -> dict[str, Any]:
-        """What the master has been told and must not forget: ids and poses by serial, and settings."""
+        """Return what the master has acknowledged and must keep: ids and poses by serial, and settings."""
         rows = (await self.operator.get("/units")).json()
         state = {row["serial"]: (row["ip"], row["id"], row["T_world_camera"]) for row in rows}
         return {**state, "settings": (await self.operator.get("/settings")).json()}
 
     async def lost(self) -> list[str]:
-        """What was acknowledged before the fault and is not so any more."""
+        """Return the names of acknowledged values that the master has lost."""
         now = await self.acknowledged()
         return [name for name, value in self._before.items() if now.get(name) != value]
 
     def expect(self, name: str, value: Any) -> None:
-        """From now on this is what was acknowledged last."""
+        """Record a newly acknowledged value."""
         self._before[name] = value
 
     def _name(self, role: str) -> str:
@@ -227,10 +227,10 @@ class Site:
 
 
 def registered(unit: Child) -> bool:
-    """Whether a unit has said so.
+    """Return True if a unit has logged its registration.
 
     Raises:
-        FaultError: it ended instead.
+        FaultError: the unit ended instead.
     """
     if unit.failed:
         raise FaultError(f"{unit.name}: {unit.ended}; {unit.log_tail()}")
@@ -240,10 +240,10 @@ def registered(unit: Child) -> bool:
 async def until(
     look: Callable[[], Found], what: str, timeout_s: float = START_S, last: Callable[[], str] = lambda: ""
 ) -> Found:
-    """What `look` finds, as soon as it finds anything; `last` tells what came instead.
+    """Wait until `look` returns a true value, and return it. `last` gives the current state for the error.
 
     Raises:
-        FaultError: it does not within `timeout_s`.
+        FaultError: not within `timeout_s`.
     """
     deadline_ns = monotonic_ns() + round(timeout_s * NS_PER_S)
     while True:
@@ -252,4 +252,4 @@ async def until(
             return found
         if monotonic_ns() > deadline_ns:
             raise FaultError(f"{what}: not within {timeout_s:g} s; {last()}")
-        await asyncio.sleep(LOOK_S)
+        await asyncio.sleep(CHECK_S)

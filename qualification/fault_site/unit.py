@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m qualification.fault_site.unit CONFIG.YAML`: the edge unit before a camera whose picture may be exchanged.
+"""`python -m qualification.fault_site.unit CONFIG.YAML`: the edge unit with a camera whose image can be exchanged.
 
-All but the source is the daemon as it is installed. A recording is read ahead of its time; this picture is read at the
-moment of its capture, so that a unit that stood still never shows what was there before.
+All but the source is the installed daemon. A recording is read ahead of its time; this image is read at the moment of
+its capture, so a unit that was stopped never shows an old image.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from shared.clock import NS_PER_S, monotonic_ns
 
 
 class PictureSource(RecordedSource):
-    """A camera that sees whatever lies in its folder now."""
+    """A camera that returns the current image in its folder."""
 
     def __init__(self, config: RecordedSourceConfig) -> None:
         super().__init__(config)

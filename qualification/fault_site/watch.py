@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whoever drives a robot by the map: asks for it all the time, and what it was told is held against the truth."""
+"""Observers that poll the map all the time, as a robot does, and comparison of its answers with the truth."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from shared.clock import NS_PER_S, monotonic_ns
 POLL_S = 0.01
 
 STALE_AFTER_S = 0.5
-"""The default."""
+"""The default of the master."""
 
 SLACK_S = 0.1
-"""For processes that share two cores with all others: when a signal takes effect, and when we are run."""
+"""Allowance for processes that share two cores: a signal takes effect late, and an observer runs late."""
 
 NOTICED_S_MAX = STALE_AFTER_S + 1.0 / FPS + POLL_S + SLACK_S
 
 RECOVERED_S_MAX = 1.0
 
 SETTLED_S = 0.5
-"""Once good, answers must stay so for this long to count as recovered."""
+"""Time for which answers must stay good to count as recovered."""
 
 SILENT_S = 1.0
-"""The stream has a heartbeat twice as often."""
+"""Silence of the stream that counts as no answer. The heartbeat is twice as frequent."""
 
 TIMEOUT_S = 0.25
-"""Who waits longer for an answer has none."""
+"""Timeout of one answer."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """One answer to GET /voxels?unseen=true, or that there was none (`now_ns` is None then)."""
+    """One answer to GET /voxels?unseen=true, or the lack of one (`now_ns` is None)."""
 
     got_ns: int
     now_ns: int | None = None
@@ -54,19 +54,19 @@ class Answer:
     held: frozenset[str] = frozenset()
     """Things whose blocks are all reported as occupied."""
     free: frozenset[str] = frozenset()
-    """Things of whose blocks one at least is neither occupied nor unseen."""
+    """Things with at least one block that is neither occupied nor unseen."""
 
 
 @dataclass(frozen=True)
 class Present:
-    """A thing, and since when it is there."""
+    """A thing, and the time since which it stands there."""
 
     thing: Thing
     since_ns: int
 
 
 class Observer(threading.Thread):
-    """Notes what the map says, until told to stop."""
+    """Records the answers of the master until stopped."""
 
     def __init__(self, port: int, things: Sequence[Thing]) -> None:
         super().__init__(name="observer", daemon=True)
@@ -76,7 +76,7 @@ class Observer(threading.Thread):
         self.answers: list[Answer] = []
 
     def stop(self) -> None:
-        """Stop asking."""
+        """Stop polling."""
         self._stopped.set()
         self.join()
 
@@ -107,8 +107,8 @@ class Observer(threading.Thread):
         )
 
 
-class Asker(Observer):
-    """Asks GET /voxels every POLL_S."""
+class Poller(Observer):
+    """Polls GET /voxels every POLL_S."""
 
     def run(self) -> None:
         """See `threading.Thread`."""
@@ -124,8 +124,8 @@ class Asker(Observer):
         connection.close()
 
 
-class Listener(Observer):
-    """Follows WS /stream; a message counts from its arrival, and silence for SILENT_S as no answer."""
+class Subscriber(Observer):
+    """Subscribes to WS /stream. A message counts from its arrival; silence for SILENT_S counts as no answer."""
 
     def run(self) -> None:
         """See `threading.Thread`."""
@@ -147,15 +147,15 @@ def _grid(shape: Sequence[int], indices: NDArray[np.int64]) -> NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the answers were worth. Times in s, None where there is none."""
+    """Judgement of the answers. Times in s, None if there is none."""
 
     noticed_s: float | None
     recovered_s: float | None
     told: str
     false_free: str
-    """The first answer that called free what was not, in words; empty when there is none."""
+    """The first answer that called an occupied place free, in words; empty if there is none."""
     complete_share: float
-    """Of the answers between the cause and its end; where there is nothing to notice, of all behind the cause."""
+    """Share of complete answers between the cause and its end; without anything to notice, of all after the cause."""
 
 
 def judge(
@@ -168,11 +168,11 @@ def judge(
     blind: bool,
     units: int,
 ) -> Verdict:
-    """Hold the answers against what was there, with a cause from `cause_ns` until `gone_ns`.
+    """Compare the answers with the truth, for a cause from `cause_ns` until `gone_ns`.
 
-    `names` is what a reason must name from `noticeable_ns` on; empty: that nobody answers tells; None: there is nothing
-    to tell. When `blind`, no answer may be complete while the cause lasts, once it can be known. `units` is how many a
-    complete map needs.
+    `names` must stand in a reason from `noticeable_ns` on. Empty: the lack of an answer suffices; None: there is
+    nothing to notice. With `blind`, no answer may be complete while the cause lasts, once it can be known. `units` is
+    the number of units of a complete map.
     """
     grace_ns = round((STALE_AFTER_S + 1.0 / FPS + SLACK_S) * NS_PER_S)
     noticed = next((a for a in answers if a.got_ns >= noticeable_ns and _tells(a, names)), None)
@@ -184,16 +184,16 @@ def judge(
         due = {present.thing.name for present in things if now_ns > present.since_ns + grace_ns}
         at = f"{(now_ns - cause_ns) / NS_PER_S:+.3f} s:"
         if due & answer.free:
-            wrong = f"{at} free although there is the {', '.join(sorted(due & answer.free))}"
+            wrong = f"{at} free although it holds the {', '.join(sorted(due & answer.free))}"
         elif answer.complete and not due <= answer.held:
             wrong = f"{at} complete without the {', '.join(sorted(due - answer.held))}"
         elif answer.complete and answer.units_live < units and now_ns > cause_ns + grace_ns:
             wrong = f"{at} complete with {answer.units_live} of {units} units"
         elif answer.complete and blind and cause_ns + grace_ns < now_ns < gone_ns:
-            wrong = f"{at} complete while nobody could know"
+            wrong = f"{at} complete although the fault hid the state"
         if wrong:
             break
-    # What nobody has to notice may be over at once, and its consequences come later.
+    # A cause that nobody has to notice may end at once, and its consequences come later.
     end_ns = gone_ns if names is not None else answers[-1].got_ns + 1
     during = [answer.complete for answer in answers if cause_ns <= answer.got_ns < end_ns]
     return Verdict(
@@ -206,7 +206,9 @@ def judge(
 
 
 def in_force(messages: Sequence[Answer]) -> list[Answer]:
-    """Of a stream: each message when it came, and once more when the next one did, until when it was what counted."""
+    """Return each message of a stream at its arrival, and again at the arrival of the next one, until which it was
+    valid.
+    """
     lasting = []
     for message, following in pairwise(messages):
         lasting.append(message)
@@ -216,7 +218,7 @@ def in_force(messages: Sequence[Answer]) -> list[Answer]:
 
 
 def good(answer: Answer, names: set[str], units: int) -> bool:
-    """Whether an answer is complete and tells of all that is there."""
+    """Return True if an answer is complete and holds all things."""
     return answer.complete and names <= answer.held and answer.units_live == units
 
 
@@ -227,7 +229,7 @@ def _tells(answer: Answer, names: str | None) -> bool:
 
 
 def _recovered_s(answers: Sequence[Answer], names: set[str], gone_ns: int, units: int) -> float | None:
-    """From `gone_ns` to the first good answer after the last bad one."""
+    """Return the seconds from `gone_ns` to the first good answer after the last bad one."""
     back_ns: int | None = None
     for answer in answers:
         if answer.got_ns < gone_ns:

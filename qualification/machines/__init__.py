@@ -3,9 +3,9 @@
 
 In the order of the flow:
 
-    hanging_unit  what runs on a machine whose frame hangs
+    hanging_unit  the unit variant whose filter hangs on demand
     containers    machines that boot systemd from one read-only root file system
     image_parts   the image that arm64 boards boot in QEMU, built as a board's is
     arm64_boards  an arm64 board in QEMU
-    fresh_debian  a Debian with only Python and make, and what a newcomer runs there
+    fresh_debian  a Debian with only Python and make, and the commands of a new user there
 """

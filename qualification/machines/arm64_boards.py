@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One arm64 board in QEMU, every instruction emulated: it boots an image as it is, and keeps nothing of what it writes.
+"""One arm64 board in QEMU, every instruction emulated. It boots an image as it is, and its writes are discarded.
 
-What differs between boards of one image is given as hardware would: an address of its own on the network, and on the
-kernel's command line which camera of the simulated cell hangs at it.
+Boards of one image differ as hardware does: each has its own network address, and its kernel command line names its
+camera of the simulated cell.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from shared.clock import monotonic_ns
 COMMAND = "qemu-system-aarch64"
 
 EMULATOR_TOOLS = {COMMAND: "qemu-system-arm", "dnsmasq": "dnsmasq-base", "ip": "iproute2"}
-"""What boards and their network take, and the package that it is in."""
+"""Commands that boards and their network need, and the package of each."""
 
 CPU = "cortex-a76"
-"""The eldest that runs kernels which were compiled for boards in common."""
+"""The oldest CPU that runs kernels compiled for all boards."""
 
 CORES, MEMORY_MB = 2, 1536
 
 ADDRESS = "52:54:00:cc:00:{:02x}"
-"""On the network; the last three bytes become the board's name."""
+"""Network address. The board's name comes from the last three bytes."""
 
 FIRST_ADDRESS = 0x10
 
@@ -35,33 +35,33 @@ CAMERA = "CELLWATCH_UNIT_SOURCE__CAMERA"
 """See `shared.configuration`."""
 
 TAIL_LINES = 60
-"""The end of a console that is shown when a board does not report."""
+"""Lines of a console that are printed when a board does not report."""
 
 
 @dataclass(eq=False)
 class Board:
-    """A board that is switched on by entering the context, and cut from power by leaving it."""
+    """A board. Entering the context switches it on; leaving the context cuts its power."""
 
     number: int
     image: Path
     console: Path
-    """What it writes to its serial line: the kernel's messages and the journal."""
+    """Output of its serial line: the kernel's messages and the journal."""
     switched_on_ns: int = field(default=0, init=False)
     _process: subprocess.Popen[bytes] | None = field(default=None, init=False)
     _stack: ExitStack = field(default_factory=ExitStack, init=False)
 
     @property
     def address(self) -> str:
-        """Of its network card."""
+        """Return the address of its network card."""
         return ADDRESS.format(FIRST_ADDRESS + self.number)
 
     @property
     def name(self) -> str:
-        """The host name that it must come to by itself."""
+        """Return the host name that the board must generate by itself."""
         return "cellwatch-" + self.address.replace(":", "")[-6:]
 
     def command(self) -> list[str]:
-        """How QEMU is called."""
+        """Return the command line of QEMU."""
         words = (
             "console=ttyAMA0", "rw", "quiet", "net.ifnames=0", "panic=-1",
             "systemd.journald.forward_to_console=1", f"systemd.setenv={CAMERA}={self.number}",
@@ -91,12 +91,12 @@ class Board:
         self._stack.close()
 
     def require_running(self) -> None:
-        """Raises MachineError when it went off by itself: its kernel panicked, or QEMU does not like its image."""
+        """Raise MachineError if the board went off by itself: its kernel panicked, or QEMU rejects its image."""
         assert self._process is not None
         if self._process.poll() is not None:
             raise MachineError(f"{self.name}: went off by itself, code {self._process.returncode}")
 
     def tail(self) -> str:
-        """The end of what it wrote."""
+        """Return the end of its console."""
         text = self.console.read_text(errors="replace") if self.console.exists() else ""
         return "\n".join(text.replace("\r", "").splitlines()[-TAIL_LINES:])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Machines that boot systemd from one read-only root file system, each in a network namespace of its own.
 
-Containers of systemd-nspawn on a bridge. All of it lives in namespaces without a name, that of processes included: the
-kernel takes away everything in them when the process dies that they were made for, however that comes to pass.
+They are containers of systemd-nspawn on a bridge. Everything runs in unnamed namespaces, including one of processes.
+The kernel removes everything in them when their first process ends, for any reason.
 """
 
 from __future__ import annotations
@@ -29,33 +29,33 @@ from shared.errors import CellwatchError
 BRIDGE = "cells0"
 
 OBSERVER_IP = "10.77.0.254"
-"""Ours, on the bridge."""
+"""Address of the test itself on the bridge."""
 
 POLL_S = 0.05
 
 POWER_ON_S = 30.0
-"""For a container to have its network, on a busy computer."""
+"""Time limit for a container to have its network on a busy computer."""
 
 COMMAND_S = 20.0
-"""For a command in a machine."""
+"""Time limit of a command in a machine."""
 
 TOOLS = {"systemd-nspawn": "systemd-container", "nsenter": "util-linux", "ip": "iproute2"}
-"""What containers and their network take, and the package that it is in."""
+"""Commands that containers and their network need, and the package of each."""
 
 NAMESPACES = ("unshare", "--net", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc")
 
 PERSISTENT = {"state": "/var/lib/private", "cache": "/var/cache/private"}
-"""What outlives a power cut: where systemd keeps the folders of services with users of their own."""
+"""Folders that survive a power cut. systemd keeps the folders of services with dynamic users there."""
 
 Found = TypeVar("Found")
 
 
 class MachineError(CellwatchError):
-    """A machine did not do in time what it should have."""
+    """A machine did not do something in time."""
 
 
 def until(look: Callable[[], Found], what: str, timeout_s: float, every_s: float = POLL_S) -> Found:
-    """What `look` finds, as soon as it finds anything; it looks again after `every_s`.
+    """Return the first true result of `look`, which is called every `every_s`.
 
     Raises:
         MachineError: not within `timeout_s`.
@@ -71,7 +71,7 @@ def until(look: Callable[[], Found], what: str, timeout_s: float, every_s: float
 
 
 def why_not() -> str | None:
-    """Why no machine can be run here, in one sentence; None where they can."""
+    """Return the reason, in one sentence, for which no machine can run here; None if machines can run."""
     if os.geteuid() != 0:
         return "only root may run containers"
     if (missing := missing_packages(TOOLS)) is not None:
@@ -87,13 +87,13 @@ def why_not() -> str | None:
 
 
 def missing_packages(tools: Mapping[str, str]) -> str | None:
-    """How to get all packages of which a command is not here, in one sentence; None where there is none."""
+    """Return a sentence with the command that installs all missing packages; None if none is missing."""
     packages = sorted({package for command, package in tools.items() if shutil.which(command) is None})
     return f"missing: apt-get install {' '.join(packages)}" if packages else None
 
 
 def container_trouble() -> str | None:
-    """What keeps the smallest of containers from running `true`."""
+    """Return the reason for which the smallest container cannot run `true`; None if it can."""
     with tempfile.TemporaryDirectory() as folder:
         for name in ("bin", "lib", "lib64", "sbin"):
             (Path(folder) / name).symlink_to(f"usr/{name}")
@@ -110,15 +110,15 @@ def container_trouble() -> str | None:
 
 
 def confine(module: str, arguments: Sequence[str], namespaces: Sequence[str] = NAMESPACES) -> None:
-    """Run `python -m module --inside arguments` in this process's place, in namespaces of its own."""
+    """Replace this process with `python -m module --inside arguments`, in namespaces of its own."""
     os.execvp(namespaces[0], (*namespaces, sys.executable, "-m", module, "--inside", *arguments))
 
 
 def make_network() -> None:
-    """A bridge, in the network namespace that this process is alone in.
+    """Make a bridge in the network namespace of this process.
 
     Raises:
-        ConfigError: the kernel has none.
+        ConfigError: the kernel has no bridge.
     """
     run("ip", "link", "set", "lo", "up")
     run("ip", "link", "add", BRIDGE, "type", "bridge")
@@ -128,7 +128,7 @@ def make_network() -> None:
 
 @dataclass(eq=False)
 class Machine:
-    """One container; leaving the context cuts its power."""
+    """One container. Leaving the context cuts its power."""
 
     name: str
     root: Path
@@ -136,14 +136,14 @@ class Machine:
     folder: Path
     binds: tuple[str, ...] = ()
     volatile: bool = True
-    """Whether what it writes outside of `PERSISTENT` is gone when its power is cut, and its root stays as it is."""
+    """If True, writes outside of `PERSISTENT` are lost when its power is cut, and its root stays unchanged."""
     _nspawn: subprocess.Popen[bytes] | None = field(default=None, init=False)
     _leader: int = field(default=0, init=False)
 
     def __enter__(self) -> Machine:
         self.folder.mkdir(parents=True, exist_ok=True)
         for name in PERSISTENT:
-            # As systemd makes them.
+            # Folder modes as systemd sets them.
             (self.folder / name).mkdir(mode=0o700, exist_ok=True)
         return self
 
@@ -151,10 +151,10 @@ class Machine:
         self.cut_power()
 
     def power_on(self) -> int:
-        """Switch it on; returns when that was (CLOCK_MONOTONIC). It has its address soon after.
+        """Switch the machine on and return the time (CLOCK_MONOTONIC). It has its address soon after.
 
         Raises:
-            MachineError: it does not come up.
+            MachineError: it does not boot.
             ConfigError: its network cannot be set up.
         """
         volatile = ["--volatile=overlay"] if self.volatile else []
@@ -177,11 +177,11 @@ class Machine:
         return began_ns
 
     def cut_power(self) -> None:
-        """Gone, without a word to anyone in it."""
+        """End the machine at once, without any signal to its processes."""
         if self._nspawn is not None:
             nspawn, self._nspawn = self._nspawn, None
             if self._leader:
-                # With it the kernel ends every process of the machine.
+                # The kernel ends every process of the machine with its first one.
                 with suppress(ProcessLookupError):
                     os.kill(self._leader, signal.SIGKILL)
                 with suppress(subprocess.TimeoutExpired):
@@ -189,14 +189,14 @@ class Machine:
             nspawn.kill()
             nspawn.wait()
             self._leader = 0
-            # The cable goes with the namespace, which the kernel takes away a moment later.
+            # The cable ends with the namespace, which the kernel removes a moment later.
             until(lambda: not Path(f"/sys/class/net/vb-{self.name}").exists(), f"{self.name}: its end", COMMAND_S)
 
     def run(self, *command: str, timeout_s: float = COMMAND_S) -> str:
-        """What a command in it prints.
+        """Run a command in the machine and return its output.
 
         Raises:
-            MachineError: it failed, or did not end.
+            MachineError: the command failed, or did not end.
         """
         inside = ("nsenter", f"--target={self._leader}", "--all", "--", *command)
         try:
@@ -208,7 +208,7 @@ class Machine:
         return done.stdout
 
     def show(self, service: str, name: str) -> str:
-        """A property of a service."""
+        """Return a property of a service."""
         return self.run("systemctl", "show", "--value", f"--property={name}", service).strip()
 
     def kill(self, service: str, number: signal.Signals) -> None:
@@ -216,7 +216,7 @@ class Machine:
         self.run("systemctl", "kill", f"--signal={number.name}", "--kill-who=main", service)
 
     def journal(self, service: str) -> str:
-        """What a service wrote since the machine was switched on."""
+        """Return the log of a service since the machine was switched on."""
         return self.run("journalctl", "--no-pager", "--quiet", "--output=short-monotonic", f"--unit={service}")
 
     def _find_leader(self) -> int:
@@ -224,7 +224,7 @@ class Machine:
         if self._nspawn.poll() is not None:
             raise MachineError(f"{self.name}: systemd-nspawn ended: {(self.folder / 'console.log').read_text()}")
         for child in psutil.Process(self._nspawn.pid).children():
-            # The container's first process; the ones before it share our network, or live but a moment.
+            # The container's first process. Those before it share our network, or end at once.
             there = ("nsenter", f"--net=/proc/{child.pid}/ns/net", "--", "ip", "link", "show", "host0")
             if not subprocess.run(there, capture_output=True, check=False).returncode:
                 return child.pid

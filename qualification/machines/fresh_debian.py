@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Debian that has only Python, its venv and make, and what an ordinary user of it runs in a checkout of ours.
+"""A Debian that has only Python, its venv and make, and the commands of an ordinary user in a checkout there.
 
-The root file system is made once and read only. What is written lies in the user's home and in /tmp, beside it. pip in
-there reaches what pip reaches here: its configuration, and every file that it names, are lent to it.
+The root file system is made once and is read-only. Writes go to the user's home and to /tmp, which lie beside it. pip
+in the machine reaches the same index as pip here: it gets this machine's configuration, and every file that it names.
 """
 
 from __future__ import annotations
@@ -23,72 +23,72 @@ from shared.errors import CellwatchError, ConfigError
 from shared.files import write_whole
 
 SUITES = {"bookworm": "3.11", "trixie": "3.13"}
-"""Debian's releases, and the Python that each has."""
+"""Debian's releases, and the Python version of each."""
 
 PACKAGES = ("make", "python3", "python3-venv")
-"""All that README asks for."""
+"""All packages that the README requires."""
 
 TOOLS = {"git": "git", "mmdebstrap": "mmdebstrap", "systemd-nspawn": "systemd-container"}
-"""What it takes here, and the package that it is in."""
+"""Commands that the test needs here, and the package of each."""
 
 NAMESPACES = ("unshare", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc")
-"""Mounts and processes end with the process that all is done for; the network is the machine's, as a newcomer's is."""
+"""Mounts and processes end with the first process. The network is this machine's, as for any new user."""
 
 USER, USER_ID = "newcomer", 1000
 HOME = "/srv/newcomer"
 CHECKOUT = f"{HOME}/cellwatch"
 REPORTS = "reports"
-"""Beside the checkout, for what is to be read here."""
+"""Folder beside the checkout, for files that the test reads."""
 
 WHEELS = "/srv/wheels"
 """pip's cache, which all roots share."""
 
 PROPAGATED = Path("/run/systemd/nspawn")
-"""Where systemd-nspawn leaves a folder for each container."""
+"""Folder in which systemd-nspawn makes a folder for each container."""
 
 DEBIAN_S = 600.0
-"""For Debian to be fetched and unpacked, a minute on a good network."""
+"""Time limit to fetch and unpack Debian, a minute on a good network."""
 
 LENT_VARIABLES = re.compile(
     r"PIP_(?!CACHE_DIR$|CONFIG_FILE$|NO_CACHE_DIR$)\w+|(?:https?|all|no)_proxy|SSL_CERT_(?:FILE|DIR)|\w+_CA_BUNDLE",
     re.IGNORECASE,
 )
-"""By these pip, and what it stands on, are told how to reach an index."""
+"""Environment variables that tell pip, and the libraries below it, how to reach an index."""
 
 UNREACHABLE = ("Retrying (Retry(", "Temporary failure in name resolution", "Name or service not known")
-"""What pip says when it is the network that fails, and not us."""
+"""Messages of pip about a failure of the network."""
 
 
 def settle_in() -> None:
-    """Have nothing of systemd-nspawn left, in namespaces of our own.
+    """Hide the traces of systemd-nspawn, in private namespaces.
 
     Raises:
-        ConfigError: it cannot be mounted over.
+        ConfigError: the folder cannot be mounted over.
     """
     PROPAGATED.mkdir(parents=True, exist_ok=True)
     run("mount", "-t", "tmpfs", "-o", "mode=0755", "tmpfs", str(PROPAGATED))
 
 
 class Unreachable(CellwatchError):
-    """Debian or the wheels cannot be fetched, which is nobody's fault here."""
+    """Debian or the wheels cannot be fetched; the project is not the cause."""
 
 
 @dataclass(frozen=True)
 class Lent:
-    """What pip in a root is given of this machine."""
+    """Parts of this machine that pip in a root gets."""
 
     variables: dict[str, str]
     configuration: str
-    """One pip.conf, as all that apply here come to."""
+    """One pip.conf, merged from all that apply here."""
     paths: tuple[Path, ...]
-    """What these name, and is there."""
+    """Existing files that the configuration names."""
 
 
 def lend(environment: Mapping[str, str], home: Path) -> Lent:
-    """What pip needs of this machine, by its environment and its configuration files."""
+    """Return the parts of this machine that pip needs, from its environment and configuration files."""
     variables = {name: value for name, value in environment.items() if LENT_VARIABLES.fullmatch(name)}
     merged = configparser.RawConfigParser()
-    # As pip does: a file that is not there is passed over, and a later one counts more.
+    # As pip does: a missing file is skipped, and a later one overrides.
     merged.read(_configuration_files(environment, home))
     values = [*variables.values(), *(value for section in merged.sections() for value in merged[section].values())]
     text = io.StringIO()
@@ -110,7 +110,7 @@ def _configuration_files(environment: Mapping[str, str], home: Path) -> Iterator
 def _paths(value: str) -> Iterator[Path]:
     for word in value.split():
         if word.startswith("file:///") and word.rstrip("/").endswith("/simple"):
-            # An index in a folder; what it lists lies beside it.
+            # An index in a folder; the files that it lists are in the same folder.
             word = word.rstrip("/").removesuffix("/simple")
         for name in word.removeprefix("file://").split(":"):
             if name.startswith("/") and not name.startswith("//") and Path(name).exists():
@@ -119,28 +119,28 @@ def _paths(value: str) -> Iterator[Path]:
 
 @dataclass(frozen=True)
 class FreshDebian:
-    """One such machine, in a folder of ours."""
+    """One such machine, in a folder of this test."""
 
     suite: str
     folder: Path
 
     @property
     def root(self) -> Path:
-        """Its root file system."""
+        """Return its root file system."""
         return self.folder / self.suite
 
     @property
     def home(self) -> Path:
-        """Where the newcomer's home lies here."""
+        """Return the path of the user's home on this machine."""
         return self.folder / "homes" / self.suite
 
     @property
     def checkout(self) -> Path:
-        """Where the newcomer's checkout lies here."""
+        """Return the path of the user's checkout on this machine."""
         return self.home / Path(CHECKOUT).name
 
     def install(self) -> bool:
-        """Make the root file system, unless one of the same packages is there; returns whether it had to be made.
+        """Make the root file system, unless one of the same packages exists. Return True if it was made.
 
         Raises:
             Unreachable: Debian cannot be fetched.
@@ -155,7 +155,7 @@ class FreshDebian:
         try:
             subprocess.run((*command, self.suite, str(self.root)), check=True, timeout=DEBIAN_S)
         except subprocess.CalledProcessError as error:
-            raise Unreachable(f"Debian {self.suite} cannot be fetched; mmdebstrap has said why") from error
+            raise Unreachable(f"Debian {self.suite} cannot be fetched; see the output of mmdebstrap above") from error
         except subprocess.TimeoutExpired as error:
             raise Unreachable(f"Debian {self.suite} cannot be fetched within {DEBIAN_S:g} s") from error
         for name, line in (
@@ -168,12 +168,12 @@ class FreshDebian:
         return True
 
     def check_out(self, source: Path, anew: bool) -> None:
-        """Give the newcomer the files of the checkout `source` that git knows, or would add.
+        """Copy those files of the checkout `source` that git tracks or would add.
 
-        With `anew` nothing of an earlier run is left; without it what that one made is: environment, compiled kernels.
+        With `anew` nothing of an earlier run is kept; without it environment and compiled kernels are kept.
 
         Raises:
-            ConfigError: it is no checkout.
+            ConfigError: the folder is no checkout.
         """
         if anew:
             _remove(self.home)
@@ -186,7 +186,7 @@ class FreshDebian:
             target = self.checkout / name
             target.parent.mkdir(parents=True, exist_ok=True)
             if not _same(source / name, target):
-                # With its time, by which make and numba tell whether what they made of it is old.
+                # The time of the file is kept, because make and numba use it to find outdated results.
                 shutil.copy2(source / name, target)
         for part in ("tmp", "shared", REPORTS):
             (self.home / part).mkdir(exist_ok=True)
@@ -198,13 +198,12 @@ class FreshDebian:
     def run(
         self, command: str, log: Path, timeout_s: float, lent: Lent, beside: Path | None = None
     ) -> tuple[int | None, str]:
-        """Run a shell's command as the newcomer, in the checkout, with `beside` as ../shared.
+        """Run a shell command as the user, in the checkout, with `beside` as ../shared.
 
-        Returns its exit code, none when it did not end in time, and what it wrote to its standard output; `log` has all
-        that it wrote.
+        Return its exit code, None if it did not end in time, and its standard output. `log` gets all output.
         """
         configuration = self.home / "pip.conf"
-        # It may hold a password.
+        # The file may hold a password.
         configuration.touch(mode=0o600)
         configuration.write_text(lent.configuration)
         os.chown(configuration, USER_ID, USER_ID)
@@ -227,7 +226,7 @@ class FreshDebian:
         said = log.with_suffix(".stdout")
         try:
             with said.open("wb") as out, log.open("wb") as err:
-                # Its own /tmp would be a tenth of the memory.
+                # Its own /tmp would be limited to a tenth of the memory.
                 done = subprocess.run(
                     words,
                     stdin=subprocess.DEVNULL,
@@ -253,7 +252,7 @@ class FreshDebian:
         return self.folder / "wheels"
 
     def _make_mount_point(self, target: str, is_folder: bool) -> None:
-        """Something to mount on, which cannot be made once the root is read-only."""
+        """Make a mount point, which is not possible after the root is read-only."""
         point = self.root / target.lstrip("/")
         if is_folder:
             point.mkdir(parents=True, exist_ok=True)
@@ -263,14 +262,14 @@ class FreshDebian:
 
 
 def is_unreachable(log: Path) -> bool:
-    """Whether a command failed for want of the network."""
+    """Return True if a command failed because of the network."""
     text = log.read_text(errors="replace")
     return any(words in text for words in UNREACHABLE)
 
 
 def _files(source: Path) -> list[str]:
-    """Files of a checkout that git knows or would add, as they are now."""
-    # As root, in somebody else's checkout.
+    """Return the files of a checkout that git tracks or would add, as they are now."""
+    # Run as root, in a checkout of another user.
     git = ("git", "-C", str(source), "-c", f"safe.directory={source}", "ls-files", "-z")
     done = subprocess.run((*git, "--cached", "--others", "--exclude-standard"), capture_output=True, check=False)
     if done.returncode:

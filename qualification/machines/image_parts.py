@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The image that `make image-test` boots, built as a board's is; compiled kernels are kept from one run to the next.
+"""The image that `make image-test` boots, built as a board's is. Compiled kernels are kept between runs.
 
-Emulated, compiling takes ten times as long as on this computer, so kernels are compiled when the image is made, and
-only when they are others than those of an earlier run.
+Emulated compilation takes ten times as long as on this computer. So kernels are compiled when the image is made, and
+only when they differ from those of earlier runs.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ CELL = CHECKOUT / "assets" / "cells" / "demo"
 DEPLOY = Path("deploy/image")
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "cellwatch" / "image-test"
-"""Outside of the checkout: a fresh one finds there what an older one has compiled."""
+"""Outside of the checkout, so that a fresh checkout uses the kernels of an older one."""
 
 CACHED_MAX = 3
-"""States of the kernels that are kept."""
+"""Number of kernel states that are kept."""
 
 PYTHON = "3.11"
-"""That of Debian 12."""
+"""Version of Debian 12."""
 
 COMPILED_BY = ("geometry/compilation/prebuilt.py", "edge_unit/daemon/warm_up.py")
 """Files that decide which kernels are compiled, and for which processor."""
@@ -45,7 +45,7 @@ CONFIGURATION = """\
 token_file: /etc/cellwatch/unit.token
 source: {kind: simulated, cell: /etc/cellwatch/cell/cell.yaml, cameras: 2, fps: 2}
 """
-"""Neither master nor address, as on any board; which of the cameras it is, each is told when it is switched on."""
+"""Neither master nor address, as on any board. Each board gets its camera at power-on."""
 
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
 
@@ -60,11 +60,13 @@ BUILD_TOOLS = {
     "mke2fs": "e2fsprogs",
     "systemctl": "systemd",
 }
-"""What building takes, and the package that it is in."""
+"""Commands that the build needs, and the package of each."""
 
 
 def state_to_compile(checkout: Path, lock: Iterable[str]) -> str:
-    """Changes whenever other kernels are to be compiled; `lock` are lines as `numba==0.68.1 --hash=...`."""
+    """Return a state that changes whenever other kernels are to be compiled. `lock` are lines as `numba==0.68.1
+    --hash=...`.
+    """
     digest = hashlib.sha256(f"{PYTHON} {kernel_state.state_of_kernels(checkout)}".encode())
     for name in COMPILED_BY:
         digest.update(f"{name}\0".encode())
@@ -76,11 +78,11 @@ def state_to_compile(checkout: Path, lock: Iterable[str]) -> str:
 
 
 def build(parts: Path, cache: Path) -> dict[str, Any]:
-    """Build wheels and image into `parts`; returns how long each took, and their sizes.
+    """Build wheels and image into `parts`. Return the duration of each step, and the sizes.
 
     Raises:
-        ConfigError: binaries of another processor cannot be run here, or the kernels could not be compiled.
-        CalledProcessError: a step failed; it has said why.
+        ConfigError: binaries of another processor cannot run here, or the kernels could not be compiled.
+        CalledProcessError: a step failed and has printed the reason.
     """
     cache = cache.expanduser()
     seconds: dict[str, float] = {}
@@ -104,7 +106,7 @@ def build(parts: Path, cache: Path) -> dict[str, Any]:
     kernels = cache / state_to_compile(CHECKOUT, (wheels / "lock.txt").read_text().splitlines())
     cached = kernels.is_dir()
     if cached:
-        print(f"  kernels: those of an earlier run, in {kernels}", flush=True)
+        print(f"  kernels: reused from an earlier run, in {kernels}", flush=True)
     else:
         print(f"  kernels: compiled with the image, by emulation, which takes minutes; kept in {kernels}", flush=True)
         cache.mkdir(parents=True, exist_ok=True)
@@ -114,7 +116,7 @@ def build(parts: Path, cache: Path) -> dict[str, Any]:
         *ours, "--kernels" if cached else "--keep-kernels", kernels,
     )  # fmt: skip
     if not kernels.is_dir():
-        raise ConfigError("kernels: expected to be compiled with the image; what is said above tells why they were not")
+        raise ConfigError("kernels: expected to be compiled with the image, found none; see the output above")
     os.utime(kernels)
     forget_all_but_newest(cache, CACHED_MAX)
     return {
@@ -126,10 +128,10 @@ def build(parts: Path, cache: Path) -> dict[str, Any]:
 
 
 def run_foreign_binaries() -> None:
-    """Have the kernel pass binaries of arm64 to QEMU, unless it runs or passes them already.
+    """Register QEMU with the kernel for arm64 binaries, unless the kernel runs or passes them already.
 
     Raises:
-        ConfigError: it cannot.
+        ConfigError: the registration failed.
     """
     if os.uname().machine == "aarch64" or (BINFMT / "qemu-aarch64").exists():
         return
@@ -141,7 +143,7 @@ def run_foreign_binaries() -> None:
 
 
 def forget_all_but_newest(cache: Path, count: int) -> None:
-    """Keep the `count` folders that were used last."""
+    """Keep the `count` most recently used folders, and delete the others."""
     folders = sorted((path for path in cache.iterdir() if path.is_dir()), key=lambda path: path.stat().st_mtime)
     for folder in folders[:-count]:
         shutil.rmtree(folder)

@@ -22,7 +22,7 @@ from edge_unit.sources.simulated import SimulatedSourceConfig
 from qualification.fault_site.clock import WallClock
 from qualification.fault_site.scene import FPS, IMAGE, NEWCOMER, RESIDENTS, T_WORLD_CAMERA, Thing, show
 from qualification.fault_site.site import ADDRESSES, FaultError, Site
-from qualification.fault_site.watch import SLACK_S, STALE_AFTER_S, Answer, Asker, Listener, Observer
+from qualification.fault_site.watch import SLACK_S, STALE_AFTER_S, Answer, Observer, Poller, Subscriber
 from qualification.networks import MASTER_IP, UNIT_IP, Cable
 from qualification.soak_site.schedule import Kind
 from shared.clock import NS_PER_S, monotonic_ns
@@ -155,8 +155,8 @@ class SoakSite(Site):
         for index in range(len(ADDRESSES)):
             await self.start_soaked(index)
         things = (*RESIDENTS, NEWCOMER)
-        self.asker, self.listener = Asker(self.port, things), Listener(self.port, things)
-        self.watching = [self.asker, self.listener]
+        self.poller, self.subscriber = Poller(self.port, things), Subscriber(self.port, things)
+        self.watching = [self.poller, self.subscriber]
         for observer in self.watching:
             observer.start()
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""That the measuring is right: baselines are what they are named for, and truth is not made by the filter."""
+"""Measurement of accuracy: baselines behave as described, and the truth does not come from the filter."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Scene:
 
 
 @pytest.mark.parametrize("thing", THINGS)
-def test_a_thing_stands_where_it_should_and_everything_measured_of_it_is_found(thing: str) -> None:
+def test_a_thing_is_at_its_place_and_every_measured_voxel_is_found(thing: str) -> None:
     scene = Scene(thing)
     middles_m = apply(inverse(scene.place.T_world_camera), scene.surface.points_m).mean(axis=0)
     assert abs(middles_m[2] - DISTANCE_M) < 0.3
@@ -72,7 +72,7 @@ def test_the_papers_rule_is_the_pipelines_own_paper_rule_but_for_the_shifted_lat
     scene = Scene("box 300 mm")
     settings = FilterSettings(density_rule="single", density_model="angular", occupancy_threshold=0.55)
     ours = Ours(settings).at(scene.place, 0.05)(scene.frame)
-    # On the stage no pixel lies between the two limits, so that only voxels and density differ.
+    # On the stage no pixel lies between the two limits, so only voxels and density differ.
     paper = Paper(0.3, 0.55).at(scene.place, 0.05)(scene.frame)
     assert len(ours) > 10
     assert len(np.intersect1d(ours, paper)) >= 0.8 * max(len(ours), len(paper))
@@ -87,12 +87,12 @@ def test_algorithms_1_and_6_are_as_the_paper_has_them() -> None:
     columns = math.degrees(math.atan(0.05)) / (math.degrees(2 * math.atan(424 / 425)) / 848)
     rows = math.degrees(math.atan(0.05)) / (math.degrees(2 * math.atan(240 / 425)) / 480)
     assert full[0] == pytest.approx(columns * rows)
-    # More than a pinhole delivers in the middle of the view, as it is an average over all of it.
+    # More than a pinhole delivers in the middle of the view, because it is an average over the whole view.
     assert full[0] > 1.2 * (425 * 0.05) ** 2
     assert full[0] / full[1] == pytest.approx(4.0, rel=0.01)
 
 
-def test_a_fixed_limit_takes_what_is_nearer_and_not_the_robot() -> None:
+def test_a_fixed_limit_keeps_nearer_pixels_except_the_robot() -> None:
     scene = Scene("arm 80 mm")
     depth = np.full_like(scene.depth, 2400)
     depth[0], depth[1] = 2390, 0
@@ -144,13 +144,13 @@ def test_errors_of_distance_are_signed_and_those_of_the_cube() -> None:
     assert scene.judge.judge(scene.surface, far).tool_errors_m[0] > 0.1
 
 
-def test_n_is_told_and_falls_with_distance() -> None:
+def test_n_is_listed_and_falls_with_distance() -> None:
     place = Scene("rod 10 mm").place
     assert visible_pixels_min(place, 0.05, 1.5) == math.ceil(0.1 * (425 * 0.05 / 1.5) ** 2)
     assert visible_pixels_min(place, 0.01, 4.0) == 1
 
 
-def test_where_ours_is_the_worse_is_said_and_where_it_is_not_is_not() -> None:
+def test_only_figures_in_which_ours_is_worse_are_listed() -> None:
     def curve(metric: str, mine: float, theirs: float) -> Curve:
         return Curve(AXES["distance"], METRICS[metric], "arm", {OURS: [(2.0, mine)], POINTS: [(2.0, theirs)]}, 5)
 
@@ -184,7 +184,7 @@ def test_tallies_add_up_by_thing_and_over_all() -> None:
     drawn = {(curve.subject, curve.metric.key): curve for curve in collection.curves()}
     assert drawn["all things", "recall_percent"].series == {OURS: [(1.0, 60.0)]}
     assert drawn["rod", "tool_median_mm"].series[OURS] == [(1.0, 10.0)]
-    # Half of the frames reported nothing: 99 % are no nearer than infinity, which is no figure.
+    # Half of the frames reported nothing, so the 99 % quantile is infinite, which is no figure.
     assert drawn["rod", "tool_p99_mm"].document()["contenders"] == {OURS: [None]}
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark of poses by the board: a view of it, and what its marks make of good and bad ones."""
+"""The benchmark of board poses: one view, and the marks of good and bad poses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_a_view_meets_the_marks() -> None:
     assert all(mark.met for mark in table.marks)
 
 
-def test_what_is_not_found_or_far_off_misses_the_marks() -> None:
+def test_a_missing_or_wrong_pose_misses_the_marks() -> None:
     board = BOARDS["colour"][1]
     good, lost = View(1.0, 0.1, 1.0, 0.1, 0.1, 9.0), View(*(5 * (math.nan,)), 9.0)
     bad = View(4.0, 0.3, 1.0, 0.1, 0.1, 9.0)

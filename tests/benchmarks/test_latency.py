@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""That each stage is put where it belongs, and that one case runs from end to end."""
+"""Assignment of times to stages, and one case from end to end."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ UNIT_STAGES = ("source", "joints", "thread", "robot", "filter", "density", "chec
 
 
 def record(number: int, captured_ms: int, sent: bool = True) -> TraceRecord:
-    """Each stage at the unit takes 1 ms, two nothing, the queue 2, the transfer 3, the merge 4: 17 in all."""
+    """Return a record in which each stage at the unit takes 1 ms, two nothing, the queue 2, the transfer 3, the merge
+    4: 17 in all.
+    """
     at_ns = captured_ms * MS
     return TraceRecord(
         number, at_ns, 1.5, b"", (4, 5, 6), 0.05, sent,
@@ -46,7 +48,7 @@ def test_stages_and_the_first_map_that_has_the_frame() -> None:
     assert [found.ms[name].tolist() for name in ("robot", "queue", "transfer", "merge", TO_MERGED)] == [
         [1.0] * 3, [2.0] * 3, [3.0] * 3, [4.0] * 3, [17.0] * 3,
     ]  # fmt: skip
-    # Of the first frame, merged at 117, the map of 116 knows nothing; the last one nobody read any more.
+    # The map of 116 does not hold the first frame, which is merged at 117. No reader received the last frame.
     assert found.ms[WHOLE[LISTENING]].tolist() == [25.0, 25.0]
     assert found.ms[f"{LISTENING}: until the next message is made"].tolist() == [2.0, 2.0]
     assert found.ms[WHOLE[ASKING]].tolist() == [66.0, 33.0]
@@ -72,7 +74,7 @@ def test_cameras_play_their_rings_at_the_moments_of_their_frames(tmp_path: Path)
             since_ns = frame.captured_at_ns - epoch_ns - round(camera_phase_s(1, 4) * NS_PER_S)
             assert since_ns == frame.frame_number * round(NS_PER_S / 15.0)
             assert frame.frame_number > last
-            # Every other frame of the ring, which has 30 a second.
+            # Every second frame of the ring, which has 30 a second.
             place = round(since_ns / NS_PER_S * RING_HZ) % 6
             assert np.array_equal(frame.depth, frames[place])
             last, count = frame.frame_number, count + 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""That the load is what units send, and that whatever a master does wrong is counted."""
+"""Load on a master: it equals the updates of units, and every failure of the master is counted."""
 
 from __future__ import annotations
 
@@ -34,12 +34,14 @@ BLOCKS = Lattice((-1.5, -1.5, -0.75), 0.1, (30, 30, 23))
 ANSWER = msgpack.packb({"received_at_ns": 1, "answered_at_ns": 2, "joints": [(7, b"", None)]})
 
 Answer = Callable[[int, bytes], tuple[int, bytes] | float | None]
-"""Of the how manieth request with which bytes: status and body, seconds to stall before a good one, None to hang up."""
+"""Maps the number and bytes of a request to status and body, to seconds of delay before a good answer, or to None to
+hang up.
+"""
 
 
 @asynccontextmanager
 async def fake_master(answer: Answer) -> AsyncIterator[str]:
-    """Something that answers at a port of its own."""
+    """Serve answers at a free port."""
     count = 0
     serving: set[asyncio.Task[Any]] = set()
 
@@ -72,7 +74,7 @@ async def fake_master(answer: Answer) -> AsyncIterator[str]:
 
 
 async def counts(folder: Path, answer: Answer, **changes: Any) -> dict[str, Any]:
-    """What a load of a second finds at a fake master."""
+    """Return the counts of a load of one second on a fake master."""
     (folder / "token").write_text("t" * 40)
     async with fake_master(answer) as url:
         fields = {"units": 1, "voxels": 100, "seconds": 1.0, "warm_up_s": 0.0, "rate_hz": 30.0, **changes}
@@ -99,7 +101,7 @@ async def test_all_that_is_answered_counts(tmp_path: Path) -> None:
     assert found["bytes_in"] == len(sizes) * (len(ANSWER) + len(b"HTTP/1.1 200 X\r\ncontent-length: 52\r\n\r\n"))
 
 
-async def test_what_is_refused_or_never_answered_is_lost(tmp_path: Path) -> None:
+async def test_a_refused_or_unanswered_update_is_lost(tmp_path: Path) -> None:
     refused = await counts(tmp_path, lambda n, _: (409, b"no") if n % 5 == 0 else (200, ANSWER))
     assert refused["lost"] == -(-refused["sent"] // 5)
     assert "409" in refused["trouble"]
@@ -119,7 +121,7 @@ async def test_a_stall_counts_for_all_that_would_have_come_meanwhile(tmp_path: P
 
 async def test_without_a_rate_the_next_follows_the_answer(tmp_path: Path) -> None:
     found = await counts(tmp_path, lambda n, _: 0.02, units=4, rate_hz=None)
-    # Fifty a second each where nothing else runs; on a busy machine fewer, but never more.
+    # Fifty a second each on an idle machine; fewer on a busy one, but never more.
     assert 4 * 3 < found["counted"] <= 4 * 50
 
 
@@ -140,7 +142,7 @@ async def test_the_bytes_are_those_of_the_units_own_client() -> None:
     assert heard == [request]
 
 
-def test_people_walk_and_shadow_what_is_behind_them() -> None:
+def test_people_walk_and_cast_a_shadow() -> None:
     one = view(1, 1000, LATTICE, BLOCKS, 6.0)
     keys = [keys_from_bytes(each, LATTICE.cell_count) for each in one.keys]
     assert {len(each) for each in keys} == {1000}
@@ -149,7 +151,7 @@ def test_people_walk_and_shadow_what_is_behind_them() -> None:
     assert len({each.bits for each in one.seen}) > len(keys) // 2
 
 
-def test_a_unit_tells_what_it_sees_when_that_changed() -> None:
+def test_a_unit_reports_seen_only_after_a_change() -> None:
     same = view(0, 100, LATTICE, BLOCKS, 2.0)
     still = View(same.keys[:1] * 2, same.seen[:1] * 2, same.seen_bytes[:1] * 2)
     unit = SimpleUnit("127.0.0.2", still, 0, b"%d\r\n\r\n")
@@ -171,7 +173,7 @@ def test_a_unit_tells_what_it_sees_when_that_changed() -> None:
         ({"complete": False, "reasons": ["the robot"]}, "the robot"),
     ],
 )
-async def test_a_wrong_map_is_told(changes: dict[str, Any], words: str) -> None:
+async def test_a_wrong_map_is_reported(changes: dict[str, Any], words: str) -> None:
     units = [SimpleUnit("", View((b"",), (), ()), 0, b""), SimpleUnit("", View((b"",), (), ()), 0, b"")]
     units[0].keys, units[1].keys = np.array([5, 6, 7], "<u4").tobytes(), np.array([6, 9], "<u4").tobytes()
     right = {"voxels": [5, 6, 7, 9], "witnesses": [1, 2, 1, 1], "units_live": 2, "complete": True, "reasons": []}
@@ -195,13 +197,13 @@ def test_a_small_run_of_the_real_thing(tmp_path: Path, capsys: pytest.CaptureFix
     assert (load["units"], load["voxels"], load["lost"], load["map_wrong"]) == (2, 100, 0, "")
     assert 400.0 < load["bytes_per_update"] <= 1200.0
     assert 0.0 < load["p50_ms"] <= load["p99_ms"] <= load["max_ms"]
-    # Far below the mark: others may be busy on the machine.
+    # Far below the mark, because other processes may be busy on the machine.
     assert document["max_updates_per_s"] > 300.0
     assert document["bare_fastapi_updates_per_s"] > 300.0
     assert Mark("", load["cpu_percent"], at_least=0.1).met
 
 
-def test_the_demo_cell_is_what_is_loaded() -> None:
+def test_the_load_uses_the_demo_cell() -> None:
     cell = Cell.load(DEMO_CELL)
     assert cell.lattice(0.05) == LATTICE
     assert cell.lattice(0.1) == BLOCKS

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""That the paper's experiment adds up: what a refresh consists of, Equation 7, and that all contenders see the same."""
+"""The paper's experiment: parts of a refresh, Equation 7, and the same frames for all contenders."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_equation_7_is_the_share_of_the_centralised_time_that_is_saved() -> None
     assert faster_percent(150.0, 100.0) == pytest.approx(-50.0)
 
 
-def test_a_refresh_is_the_slowest_unit_and_what_waits_behind_it() -> None:
+def test_a_refresh_is_the_slowest_unit_and_its_queue() -> None:
     parts = Parts("424x240", 20)
     parts.unit_ms, parts.trip_ms = [[4.0, 2.0, 7.0, 1.0]], [[1.0, 5.0, 1.0, 1.0]]
     parts.rush_ms, parts.merge_ms = [[1.0, 0.5, 1.5, 3.0]], [[0.1, 0.2, 0.3, 0.4]]
@@ -49,14 +49,14 @@ def test_a_refresh_is_the_slowest_unit_and_what_waits_behind_it() -> None:
 
 
 def book_of(contender: str, until_ms: dict[int, list[float]], voxel_size_m: float = 0.02) -> Book:
-    """A book with these rounds of one resolution."""
+    """Return a book with these rounds of one resolution."""
     book = Book()
     for rounds in until_ms.values():
         book.add(contender, "424x240", voxel_size_m, rounds)
     return book
 
 
-def test_tables_tell_medians_and_leave_out_what_was_not_measured() -> None:
+def test_tables_hold_medians_of_measured_cases_only() -> None:
     book = book_of(UNITS_COMPOSED, {0: [1.0, 2.0, 3.0, 4.0], 1: [1.0, 2.0, 5.0, 6.0], 2: [1.0, 2.0, 4.0, 5.0]})
     book.add(ONE_PROCESS, "424x240", 0.02, [2.0, 4.0, 8.0, 20.0])
     book.add(ONE_PROCESS, "424x240", 0.05, [2.0, 4.0, 8.0, 20.0])
@@ -71,7 +71,7 @@ def test_tables_tell_medians_and_leave_out_what_was_not_measured() -> None:
     assert [row[2] for row in rows] == pytest.approx([50.0, 50.0, 50.0, 75.0])
 
 
-def test_marks_compare_what_they_say() -> None:
+def test_marks_compare_the_figures_that_they_name() -> None:
     book = book_of(UNITS_COMPOSED, {0: [1.0, 1.0, 1.0, 6.0]}, 0.01)
     book.add(UNITS_COMPOSED, "424x240", 0.05, [1.0, 1.0, 1.0, 4.0])
     same = Parts("424x240", 20)
@@ -90,9 +90,9 @@ def seen() -> Views:
 
 
 @needs_peers
-def test_every_camera_sees_the_person_and_one_process_finds_what_units_find(seen: Views) -> None:
+def test_every_camera_sees_the_person_and_one_process_equals_the_units(seen: Views) -> None:
     work = prepared(seen, 0.05)
-    sights = [each.look(seen.depth[i, 1], seen.joints[1]) for i, each in enumerate(work)]
+    sights = [each.filter_frame(seen.depth[i, 1], seen.joints[1]) for i, each in enumerate(work)]
     assert all(len(sight.voxels) > 20 for sight in sights)
     assert all(sight.seen.bits and sight.health.agreeing_share > 0.5 for sight in sights)
     centralised = Centralised(work)
@@ -104,13 +104,13 @@ def test_every_camera_sees_the_person_and_one_process_finds_what_units_find(seen
 
 
 @needs_peers
-def test_the_octree_gets_what_the_filter_lets_through(seen: Views) -> None:
+def test_the_octree_gets_the_pixels_that_the_filter_keeps(seen: Views) -> None:
     work = prepared(seen, 0.05)
     octree = IntoOctree(seen, work)
     for camera, each in enumerate(work):
         ours = each.pipeline.foreground(seen.depth[camera, 0], seen.joints[0])
         theirs = octree.foreground(camera, 0)
-        # Its self filter knows nothing of the pixels between two surfaces, so it lets more through.
+        # Its self filter ignores the pixels between two surfaces, so it lets more through.
         assert (ours & theirs).sum() > 0.95 * ours.sum()
         assert theirs.mean() < ours.mean() + 0.05
     first, *_, last = octree.refresh(0)
@@ -140,7 +140,7 @@ def test_the_master_watches_the_same_cell(seen: Views, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_a_small_run_of_the_real_thing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    # Whether marks are met on a busy machine is no question of this test.
+    # The marks may be missed on a busy machine; this test does not check them.
     paper.main(["--quick", "--results", str(tmp_path)])
     document = json.loads(capsys.readouterr().out.splitlines()[-1])
     kept = json.loads((tmp_path / "paper.json").read_text())
@@ -153,6 +153,6 @@ def test_a_small_run_of_the_real_thing(tmp_path: Path, capsys: pytest.CaptureFix
     assert [len(line) for line in document["by_cameras"]["series"].values()] == [CAMERAS] * 3
     for row in document["anatomy"]["rows"]:
         assert 400.0 < row["bytes an update"] < 40_000.0
-    # On any machine, however busy: an octree with rays costs several times what the filter does.
+    # Holds on any machine, however busy: an octree with rays costs several times as much as the filter.
     for row in document["figure_12_faster"]["rows"]:
         assert row["than centralised, as MoveIt's updaters %"] > 30.0

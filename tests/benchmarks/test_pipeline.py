@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""That the measuring itself is right: turns, medians, and frames of the share of foreground that they promise."""
+"""Measurement of the pipeline: turns, medians, and frames with the promised share of foreground."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def test_contenders_take_turns_over_the_same_frames() -> None:
     assert all(len(turn) == FRAMES_A_TURN for turn in spent["a"].turns)
 
 
-def test_only_a_part_of_some_work_counts_where_it_says_so() -> None:
-    """A number that some work returns is none of its time."""
+def test_only_a_returned_part_counts() -> None:
+    """A number that some work returns is not its duration."""
     spent = in_turns({"part": lambda _n: Part(5_000_000), "number": lambda n: 5_000_000_000 + n}, turns=1, frames=4)
     assert spent["part"].turns == [[5.0] * FRAMES_A_TURN]
     assert max(spent["number"].turns[0]) < 5000.0
 
 
-def test_the_first_frame_of_a_turn_is_told_apart() -> None:
+def test_the_first_frame_of_a_turn_is_listed_separately() -> None:
     spent = Spent()
     spent.turns = [[5.0, 1.0, 1.0], [7.0, 1.0, 1.0], [6.0, 1.0, 1.0]]
     assert spent.median == 1.0
@@ -45,7 +45,7 @@ def test_the_first_frame_of_a_turn_is_told_apart() -> None:
 
 @pytest.mark.skipif(importlib.util.find_spec("dufomap") is None, reason="there is none for this processor")
 @needs_peers
-def test_dufomap_marks_the_space_before_what_it_is_given() -> None:
+def test_dufomap_marks_the_space_before_its_points() -> None:
     from benchmarks.peers import contenders
 
     cell = room()

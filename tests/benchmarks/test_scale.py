@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""That the age of a map is what was merged when it was made, and that one bench runs from end to end."""
+"""The age of a map comes from the frames that were merged when it was made; one bench runs from end to end."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def reading(made_ms: int, decoded_ms: int) -> Reading:
     return Reading(made_ms * MS, made_ms * MS, decoded_ms * MS, decoded_ms * MS, 100, 3, True, 0.02)
 
 
-def test_ages_are_of_what_was_merged_when_the_map_was_made() -> None:
+def test_ages_come_from_the_frames_merged_before_the_map() -> None:
     merged = np.array([(0, 10, 30, 31), (1, 20, 40, 41), (0, 70, 90, 91)], np.int64)
     merged[:, 1:] *= MS
     found = ages(merged, [reading(50, 55), reading(95, 100), reading(200, 201)], 45 * MS, 150 * MS)
@@ -36,12 +36,12 @@ def test_ages_are_of_what_was_merged_when_the_map_was_made() -> None:
     assert found == Ages(2, np.median([35.0, 30.0]), np.median([45.0, 80.0]), pytest.approx(80.0, abs=0.5))
 
 
-def test_nobody_who_read_has_no_age() -> None:
+def test_without_readings_there_is_no_age() -> None:
     assert math.isnan(ages(np.zeros((0, 4), np.int64), [], 0, 1).oldest_p50)
 
 
 @pytest.mark.parametrize(
-    ("step", "asked", "carried"),
+    ("step", "polled", "carried"),
     [
         (STEP, FRESH, True),
         (replace(STEP, lost=1), FRESH, False),
@@ -50,8 +50,8 @@ def test_nobody_who_read_has_no_age() -> None:
         (STEP, replace(FRESH, oldest_p99=math.nan), False),
     ],
 )
-def test_what_is_carried_arrives_is_right_and_fresh(step: Step, asked: Ages, carried: bool) -> None:
-    assert Row(step, asked, FRESH, False).carried is carried
+def test_a_carried_load_arrives_and_is_right_and_fresh(step: Step, polled: Ages, carried: bool) -> None:
+    assert Row(step, polled, FRESH, False).carried is carried
 
 
 def test_the_cost_of_an_update_is_the_slope_where_there_was_cpu_left() -> None:

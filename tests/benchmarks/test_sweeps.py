@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The marks of the sweeps with few frames each, and that the sweeps can miss them."""
+"""The marks of the sweeps with few frames each; they can be missed."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_rods_tilt_as_far_as_they_should(tilt_max_deg: float) -> None:
     assert tilt_deg.min() < 5.0
 
 
-def test_only_what_is_reported_where_the_thing_stands_counts() -> None:
+def test_only_voxels_at_the_thing_count() -> None:
     stage = above_table(1.5, DepthNoise.none(), 0)
     mesh = box_mesh("box", (0.1, 0.1, 0.3))
 
@@ -124,7 +124,7 @@ def test_jobs_come_back_in_their_order(processes: int) -> None:
         assert run([partial(pow, 2, power) for power in range(20)]) == [2**power for power in range(20)]
 
 
-def test_the_command_prints_json_and_tells_of_a_missed_mark(
+def test_the_command_prints_json_and_reports_a_missed_mark(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     mark = Mark("lost, %", 3.0, at_most=1.0)

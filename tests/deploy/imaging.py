@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A card image as NVIDIA's are laid out, made a unit's by `build-image --base`, and booted; prints what came of it.
+"""Convert a card image laid out like NVIDIA's to a unit's by `build-image --base`, boot it, and print the results.
 
 Run by `test_build_image.py`, in namespaces of its own.
 """
@@ -24,14 +24,14 @@ BOOT_S = 180.0
 SECTOR_BYTES = 512
 ROOT_SECTOR = 65536
 LAYOUT = f"label: gpt\n1: start={ROOT_SECTOR}, name=APP\n2: start=2048, size=8192, name=A_kernel\n"
-"""The root file system is the first by its number and the last by its place."""
+"""The root file system is the first by its number and the last by its position."""
 
 FREE_MB = 600
-"""What a card image has left."""
+"""Free space of a card image."""
 
 
 def run(*command: str) -> str:
-    """What a command prints."""
+    """Run a command and return its output."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise MachineError(f"{' '.join(command)}: {done.stderr.strip() or done.stdout.strip()}")
@@ -39,7 +39,7 @@ def run(*command: str) -> str:
 
 
 def card_image(roots: Path, folder: Path) -> Path:
-    """A zip with the image of a card that a bare Debian is on."""
+    """Make a zip with the image of a card that holds a bare Debian."""
     root = folder / "bare"
     root.mkdir()
     run("tar", "-C", str(root), "-xf", str(roots / "debian.tar"))
@@ -62,7 +62,7 @@ def card_image(roots: Path, folder: Path) -> Path:
 
 
 def build(roots: Path, folder: Path) -> dict[str, Any]:
-    """The unit's image, its partition table and file system looked at, and what it does when it is booted."""
+    """Build the unit's image, inspect its partition table and file system, and boot it. Return the findings."""
     make_network()
     release = roots / "unit" / "opt" / "cellwatch" / (roots / "unit" / "opt" / "cellwatch" / "current").readlink()
     packed = folder / "unit.img.zst"
@@ -100,7 +100,7 @@ def build(roots: Path, folder: Path) -> dict[str, Any]:
 
 
 def active(machine: Machine) -> bool:
-    """Whether the unit's service has told that it is ready."""
+    """Return True if the unit's service has reported that it is ready."""
     try:
         return machine.show("edge-unit.service", "ActiveState") == "active"
     except MachineError:

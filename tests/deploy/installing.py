@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`install.sh` on a machine that runs: a master, a unit beside it, an update of both, and back; prints what came of it.
+"""Run `install.sh` on a running machine: a master, a unit beside it, an update of both, and a rollback. Print the
+results.
 
 Run by `test_install.py`, in namespaces of its own.
 """
@@ -26,7 +27,7 @@ LIVE_S = 180.0
 
 
 def newer(wheels: Path, folder: Path) -> None:
-    """The same wheels, but for a Cellwatch of another version."""
+    """Copy the wheels, with a Cellwatch of another version."""
     folder.mkdir()
     for file in wheels.iterdir():
         if not file.name.startswith("cellwatch-"):
@@ -52,7 +53,7 @@ def newer(wheels: Path, folder: Path) -> None:
 
 
 class Board:
-    """A machine that was set up by somebody else, with a checkout and wheels at hand."""
+    """A machine that is already set up, with a checkout and wheels."""
 
     def __init__(self, machine: Machine) -> None:
         self.machine = machine
@@ -87,7 +88,7 @@ class Board:
 
 
 def rehearse(roots: Path, folder: Path) -> dict[str, Any]:
-    """What a person does who follows docs/deploy.md."""
+    """Follow docs/deploy.md as a person would."""
     make_network()
     root = folder / "root"
     root.mkdir()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What makes a root file system a unit, on a small one of our own; no network, no board, nothing emulated."""
+"""Customisation of a small root file system to a unit; no network, no board, nothing emulated."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_every_wheel_is_known_by_its_hash_and_none_by_its_place(lock: Path) -> N
 
 
 class Bench:
-    """A root file system with next to nothing in it, and wheels that are as small."""
+    """A nearly empty root file system, and wheels that are as small."""
 
     def __init__(self, folder: Path, version: str = "3.12", machine: int = AARCH64) -> None:
         self.folder = folder
@@ -118,12 +118,12 @@ class Bench:
         return subprocess.run(command, capture_output=True, text=True, check=False)
 
     def sources(self, kernels: str) -> dict[str, str]:
-        """Files of a release whose kernels are `kernels`."""
+        """Return the files of a release whose kernels are `kernels`."""
         state = "geometry/compilation/kernel_state.py"
         return {state: (CHECKOUT / state).read_text()} | {f"{folder}/some.py": kernels for folder in FOLDERS}
 
     def state(self, kernels: str) -> str:
-        """The state of a release whose kernels are `kernels`."""
+        """Return the state of a release whose kernels are `kernels`."""
         with tempfile.TemporaryDirectory(dir=self.folder) as place:
             for name, text in self.sources(kernels).items():
                 (Path(place) / name).parent.mkdir(parents=True, exist_ok=True)
@@ -131,7 +131,7 @@ class Bench:
             return state_of_kernels(Path(place))
 
     def compile_kernels(self, source: str, python: str = "py312") -> str:
-        """What `edge-unit compile-kernels` leaves, for kernels of this source."""
+        """Write the output of `edge-unit compile-kernels` for kernels of this source."""
         state = self.state(source)
         kernels = self.folder / f"compiled-{state}-{python}"
         place = kernels / "armv8.2-a" / f"kernels-{state}" / "kernels_0123"
@@ -141,7 +141,7 @@ class Bench:
         return str(kernels)
 
     def tree(self) -> dict[str, tuple[int, int, bytes]]:
-        """What lies there, but for compiled bytecode."""
+        """Return all files, except compiled bytecode."""
         found = {}
         for path in sorted(self.root.rglob("*")):
             if "__pycache__" not in path.parts and not path.is_dir():
@@ -239,7 +239,7 @@ def test_another_system_is_refused_with_the_reason(tmp_path: Path, version: str,
 
 
 @needs_root
-def test_what_is_missing_or_contradicts_itself_is_named(tmp_path: Path) -> None:
+def test_missing_and_contradictory_options_are_named(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     token = bench.put_beside("bad.token", "two lines\nof text\n")
     assert "expected a token in one line" in bench.customise("--token", token).stderr
@@ -298,7 +298,7 @@ def test_a_board_that_is_master_and_unit_needs_the_wheels_of_both(tmp_path: Path
     (bench.folder / "cell").mkdir()
     cell = bench.put_beside("cell/cell.yaml", "name: cell\n")
     refused = bench.customise("--role", "master", "--cell", str(Path(cell).parent))
-    assert "master-server is to run there: build the wheelhouse with --extras edge,realsense,master" in refused.stderr
+    assert "master-server also runs there: build the wheelhouse with --extras edge,realsense,master" in refused.stderr
     assert not (bench.root / "etc/systemd/system/master-server.service").exists()
 
 

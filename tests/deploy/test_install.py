@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The installation on a running machine, as its documentation tells: master, unit, update, and back."""
+"""The installation on a running machine as documented: master, unit, update, and rollback."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_running_machine_becomes_master_and_unit_and_is_updated_and_taken_back
         "edge-unit 0.1.0",
     ]
     assert [release.split("-")[0] for release in found["releases"]] == ["0.1.0", "9.9.9"]
-    # The one slot is still that of this board, under its own address; its identity is its own.
+    # The only slot is still that of this board, under its own address; its identity is its own.
     assert {found[stage]["id"] for stage in ("installed", "updated", "back")} == {found["installed"]["id"]}
     assert not found["name"].startswith("cellwatch-")
     assert found["compiled"] == 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The unit files as systemd itself judges them, and against what the oldest supported one knows."""
+"""The unit files, verified by systemd itself and by the settings of the oldest supported version."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ KNOWN_TO_249 = {
     "SystemCallArchitectures SystemCallErrorNumber SystemCallFilter TasksMax TimeoutAbortSec TimeoutStartSec "
     "TimeoutStopSec Type UMask WatchdogSec",
 }
-"""What is used, each looked up in the manual of systemd 249; others are looked up there before they are added."""
+"""Settings in use, each looked up in the manual of systemd 249. Look up a new setting there before adding it."""
 
 
 class UnitFile(configparser.RawConfigParser):
-    """A unit file: keys keep their case; of those that come twice the last is enough here."""
+    """A unit file: keys keep their case. Of a repeated key the last value is kept, which suffices here."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(strict=False, interpolation=None, comment_prefixes=("#",), delimiters=("=",))
@@ -53,7 +53,7 @@ def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize("service", DAEMONS, ids=lambda path: path.name)
 def test_systemd_has_nothing_to_say(service: Path) -> None:
     verified = analyze("verify", str(service))
-    # An unknown setting is only a warning to it.
+    # systemd only warns about an unknown setting.
     assert (verified.returncode, verified.stderr, verified.stdout) == (0, "", "")
 
 
@@ -64,7 +64,7 @@ def test_systemd_would_say_something(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("service", DAEMONS, ids=lambda path: path.name)
-def test_little_is_left_to_whoever_breaks_in(service: Path) -> None:
+def test_the_services_have_few_privileges(service: Path) -> None:
     judged = analyze("security", "--offline=true", f"--threshold={round(10 * EXPOSURE_MAX)}", str(service))
     assert judged.returncode == 0, judged.stdout
 

@@ -62,7 +62,7 @@ def test_no_file_is_needed() -> None:
         ("fps: 1", "fps: extra inputs"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, line: str, words: str) -> None:
+def test_an_error_names_the_value(tmp_path: Path, line: str, words: str) -> None:
     name = line.split(":")[0]
     kept = [one for one in FILE.strip().splitlines() if not one.startswith(f"{name}:")]
     with pytest.raises(ConfigError) as caught:
@@ -71,7 +71,7 @@ def test_what_is_wrong_is_named(tmp_path: Path, line: str, words: str) -> None:
     assert "unit.yaml" in str(caught.value)
 
 
-def test_the_token_is_never_shown(tmp_path: Path) -> None:
+def test_the_token_is_never_printed(tmp_path: Path) -> None:
     config = UnitConfig(source=SimulatedSourceConfig(), token=SecretStr("secret-0123456789"))
     assert "secret" not in repr(config)
     assert config.read_token() == "secret-0123456789"
@@ -114,7 +114,7 @@ def test_a_pose_file_that_holds_none_is_named(tmp_path: Path, text: str) -> None
         read_pose(path)
 
 
-def test_state_lies_where_the_service_manager_wants_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_state_lies_in_the_service_managers_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
     config = UnitConfig(source=SimulatedSourceConfig())

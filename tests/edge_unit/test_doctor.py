@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The doctor's findings: right, and each with what to do."""
+"""The doctor's findings: right, and each with its remedy."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_the_rate_is_held_against_the_wanted_one(fps: float, level: str) -> None
     assert ("more light" in found.text) == (level != "ok")
 
 
-def test_where_no_rate_is_wanted_any_is_right() -> None:
+def test_without_a_configured_rate_any_rate_is_ok() -> None:
     assert only(list(doctor.stream(INFO, measured(2.0), None)), "stream").level == "ok"
 
 
@@ -70,7 +70,7 @@ def test_the_wall_clock(monkeypatch: pytest.MonkeyPatch, wall_s: int, is_set: bo
     assert doctor.clock().level == level
 
 
-async def test_without_master_and_camera_it_says_how_to_go_on() -> None:
+async def test_without_master_and_camera_it_gives_the_remedies() -> None:
     config = UnitConfig(source=RealsenseSourceConfig(), master_url=NO_MASTER, token="secret")
     findings = [finding async for finding in examine(config)]
     master, camera = only(findings, "master"), only(findings, "camera")
@@ -79,7 +79,7 @@ async def test_without_master_and_camera_it_says_how_to_go_on() -> None:
     assert camera.level == "FAIL"
     assert "play a recording (source.recording) or simulate (source.kind: simulated)" in camera.text
     assert "secret" not in "".join(map(str, findings))
-    # It does not wait for a camera that is not there.
+    # It does not wait for an absent camera.
     assert findings[-1] is camera
 
 
@@ -92,7 +92,7 @@ async def test_an_absent_serial_is_named() -> None:
     assert only(findings, "camera").text == "source.serial is 42, and there is none: correct it, or plug it in"
 
 
-async def test_with_a_recording_all_but_the_master_is_looked_at(tmp_path: Path) -> None:
+async def test_with_a_recording_all_but_the_master_is_checked(tmp_path: Path) -> None:
     recording = await asyncio.to_thread(recordings.write, tmp_path / "camera.db3", 30, usb=2.1)
     source = RealsenseSourceConfig(recording=recording, loop=True)
     config = UnitConfig(source=source, master_url=NO_MASTER, token="x")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The source that the configuration chose."""
+"""The source that the configuration selects."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_the_configuration_chooses(config: SourceConfig, kind: type, recording: 
     assert is_recording(config) is recording
 
 
-def test_other_hardware_stands_behind_the_same_configuration() -> None:
+def test_other_hardware_can_replace_a_source() -> None:
     made = RecordedSource(RecordedSourceConfig(folder=Path("images")))
     factories = {**FACTORIES, SimulatedSourceConfig: lambda _config: made}
     assert make_source(SimulatedSourceConfig(), factories) is made

@@ -21,7 +21,7 @@ TOKEN = "secret-token-0123456789"
 
 
 class Server:
-    """Speaks TLS with one certificate, refuses everything, and keeps all bytes that it was sent."""
+    """Speaks TLS with one certificate, refuses everything, and records all bytes received."""
 
     def __init__(self, certificate: trustme.LeafCert) -> None:
         self.context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -38,7 +38,7 @@ class Server:
                 if data.endswith(b"\r\n\r\n"):
                     writer.write(b"HTTP/1.1 404 Not Found\r\ncontent-length: 0\r\n\r\n")
         except OSError:
-            # A client that does not believe it breaks off.
+            # A client that does not trust it closes the connection.
             pass
         finally:
             writer.close()
@@ -128,7 +128,7 @@ async def test_a_server_of_an_older_tls_gets_nothing(ours: trustme.CA, ca_file: 
     assert not old.received
 
 
-def test_a_master_without_tls_is_refused_where_its_certificate_is_to_be_checked(ca_file: Path) -> None:
+def test_a_master_without_tls_is_refused_if_its_certificate_must_be_checked(ca_file: Path) -> None:
     with pytest.raises(ConfigError, match="master_url: expected https"):
         MasterClient("http://127.0.0.1:1", lambda: TOKEN, tls=tls_context(ca_file))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Machines with systemd: three units from one read-only root file system that crash, stand still and lose power."""
+"""Machines with systemd: three units from one read-only root file system that crash, hang and lose power."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_machines_come_back_by_themselves_whatever_befalls_them(roots: Path) -> 
     done = subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True, timeout=1450, check=False)
     assert done.stdout.endswith("}\n"), done.stderr + done.stdout
     document = json.loads(done.stdout.splitlines()[-1])
-    # How soon is for `make rehearsal` on a quiet computer; here, that it happens at all, and without anyone's help.
+    # Times are tested by `make rehearsal` on a quiet computer. This test requires recovery without help, at any time.
     assert document["switch_on"]["compiled"] == 0
     joined = document["join"]
     for count in ("machines_posting", "found_by_mdns", "distinct_names", "distinct_host_keys", "distinct_machine_ids"):

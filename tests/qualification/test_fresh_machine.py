@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `make fresh-machine` makes of a machine, a checkout, a demo and a report; no Debian is fetched here."""
+"""Results of `make fresh-machine` from given machines, checkouts, demos and reports; no Debian is fetched here."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ REPORT = """<testsuites><testsuite tests="7">
 FIGURES: dict[str, Any] = {"failures": [], "fps_per_unit": [15.0, 14.9, 15.0, 14.8]}
 
 
-# ---------------------------------------------------------------- what came of it
+# ---------------------------------------------------------------- results
 
 
-def test_reports_are_counted_with_the_reasons_of_what_was_skipped(tmp_path: Path) -> None:
+def test_reports_are_counted_with_the_reasons_of_skips(tmp_path: Path) -> None:
     for name in ("of-many-at-once", "one-by-one"):
         (tmp_path / name).write_text(REPORT)
     tests = counted(tmp_path, 2)
@@ -60,14 +60,14 @@ def test_where_no_test_failed_and_the_command_did_one_has_failed(
         (0, "making .venv\n" + json.dumps(FIGURES) + "\n", None),
         (None, json.dumps(FIGURES), "it did not end"),
         (2, json.dumps(FIGURES), "it ended with 2"),
-        (0, "", "its last line is no JSON"),
-        (0, "Ctrl-C ends it\n", "its last line is no JSON"),
+        (0, "", "its last line is not JSON"),
+        (0, "Ctrl-C ends it\n", "its last line is not JSON"),
         (0, json.dumps(FIGURES | {"failures": ["unit2 is blind: why", "unit3"]}), "unit2 is blind: why; unit3"),
         (0, json.dumps(FIGURES | {"fps_per_unit": [15.0] * 3}), "expected frames of 4 units, got [15.0, 15.0, 15.0]"),
         (0, json.dumps(FIGURES | {"fps_per_unit": [15.0, 0.0] * 2}), "expected frames of 4 units, got [15.0, 0.0"),
     ],
 )
-def test_a_demo_is_well_only_with_the_frames_of_all_units(code: int | None, said: str, trouble: str | None) -> None:
+def test_a_demo_is_good_only_with_frames_of_all_units(code: int | None, said: str, trouble: str | None) -> None:
     found = demo_trouble(code, said)
     assert (found is None) if trouble is None else (found or "").startswith(trouble)
 
@@ -76,11 +76,11 @@ def test_tests_of_the_smoke_part_are_there() -> None:
     assert [name for name in SMOKE_TESTS if not (CHECKOUT / name).is_file()] == []
 
 
-# ---------------------------------------------------------------- how it ends
+# ---------------------------------------------------------------- exit codes
 
 
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *came: Row | BaseException) -> int:
-    """The command, inside of its namespaces, where the machines come to this."""
+    """Run the command inside of its namespaces, with machines that give these results."""
     each = iter(came)
 
     def pay(_: object) -> Row:
@@ -160,9 +160,7 @@ def test_pip_is_lent_its_configuration_and_the_files_that_it_names(tmp_path: Pat
     assert "[install]\nno-compile = yes" in lent.configuration
 
 
-def test_the_newcomer_has_what_git_knows_and_keeps_what_it_made_of_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_user_gets_the_files_of_git_and_keeps_the_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     need_command("git", "git")
     monkeypatch.setattr(fresh_debian, "USER_ID", os.getuid())
     source = tmp_path / "source"
@@ -187,7 +185,7 @@ def test_the_newcomer_has_what_git_knows_and_keeps_what_it_made_of_it(
 
 
 def test_a_root_is_made_again_only_for_other_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # In place of mmdebstrap one that does what matters here, or fails.
+    # A substitute for mmdebstrap that does the relevant part, or fails.
     commands = tmp_path / "bin"
     commands.mkdir()
     fake = commands / "mmdebstrap"
@@ -216,8 +214,6 @@ def test_a_root_is_made_again_only_for_other_packages(tmp_path: Path, monkeypatc
         ("ERROR: No matching distribution found for pyrealsense2==1.0", False),
     ],
 )
-def test_a_network_that_fails_is_told_from_a_wheel_that_is_missing(
-    tmp_path: Path, text: str, unreachable: bool
-) -> None:
+def test_a_network_failure_differs_from_a_missing_wheel(tmp_path: Path, text: str, unreachable: bool) -> None:
     (tmp_path / "log").write_text(text)
     assert is_unreachable(tmp_path / "log") == unreachable

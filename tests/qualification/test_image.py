@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `make image-test` is made of, without QEMU; and all of it where there is an image to boot."""
+"""Parts of `make image-test` without QEMU, and the whole test if an image exists."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_boards_differ_by_address_and_camera_and_by_nothing_else(tmp_path: Path)
         assert ours.replace(was, becomes) == theirs
 
 
-def test_the_camera_that_a_board_is_told_is_one_that_a_unit_understands(tmp_path: Path) -> None:
+def test_the_camera_of_a_board_is_valid_for_a_unit(tmp_path: Path) -> None:
     words = boards(tmp_path)[1].command()
     told = next(word for word in words[words.index("-append") + 1].split() if word.startswith("systemd.setenv="))
     name, value = told.removeprefix("systemd.setenv=").split("=")
@@ -68,7 +68,7 @@ def test_a_board_is_expected_under_the_name_that_its_first_boot_gives_it(tmp_pat
     assert named.stdout.strip() == board.name
 
 
-def test_a_board_that_goes_off_is_told_with_the_end_of_its_console(tmp_path: Path) -> None:
+def test_a_board_that_goes_off_is_reported_with_its_console(tmp_path: Path) -> None:
     board = boards(tmp_path)[0]
     board.console.write_text("".join(f"line {number}\r\n" for number in range(200)))
     board._process = subprocess.Popen([sys.executable, "-c", "raise SystemExit(3)"])
@@ -79,14 +79,14 @@ def test_a_board_that_goes_off_is_told_with_the_end_of_its_console(tmp_path: Pat
     assert len(board.tail().splitlines()) < 100
 
 
-# ---------------------------------------------------------------- what is found
+# ---------------------------------------------------------------- findings
 
 
 class Running(Board):
-    """One that is always on."""
+    """A board that is always on."""
 
     def require_running(self) -> None:
-        """It is."""
+        """Do nothing: the board runs."""
 
 
 def watch_of(tmp_path: Path, rows: list[dict[str, Any]], leases: str) -> Watch:
@@ -177,7 +177,7 @@ def test_all_packages_that_are_missing_are_named_at_once(monkeypatch: pytest.Mon
 
 @pytest.fixture
 def sources(tmp_path: Path) -> Path:
-    """A copy of all files that decide what is compiled."""
+    """Copy all files that decide which kernels are compiled."""
     for name in (*FOLDERS, *COMPILED_BY):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         copy = shutil.copytree if (CHECKOUT / name).is_dir() else shutil.copy
@@ -208,7 +208,7 @@ def test_kernels_that_were_used_last_are_kept(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"newest", "middle"}
 
 
-# ---------------------------------------------------------------- all of it
+# ---------------------------------------------------------------- the whole test
 
 
 @pytest.mark.slow
@@ -218,7 +218,7 @@ def test_kernels_that_were_used_last_are_kept(tmp_path: Path) -> None:
 @pytest.mark.skipif(
     not (PARTS / "image" / "disk.img").exists(), reason="there is no image: `make image-test` builds it"
 )
-def test_two_boards_of_one_image_report_to_a_master_that_nobody_told_them_of() -> None:
+def test_two_boards_of_one_image_find_a_master_and_report() -> None:
     command = [sys.executable, "-m", "qualification.image", "--parts", str(PARTS), "--no-build", "--no-results"]
     done = subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True, timeout=680, check=False)
     document = json.loads(done.stdout.splitlines()[-1])

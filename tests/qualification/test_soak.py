@@ -38,7 +38,7 @@ def test_the_same_seed_draws_the_same_faults_and_no_target_is_struck_twice_at_on
             assert one.at_s + one.hold_s <= following.at_s + 0.002
 
 
-def test_what_lives_long_is_ended_in_the_beginning_only() -> None:
+def test_long_lived_processes_end_only_in_early_rounds() -> None:
     late = {strike.name for strike in schedule(KINDS, "7", 600.0, early=False)}
     assert late == {name for name, kind in KINDS.items() if not kind.early}
     assert "master killed" not in late
@@ -80,7 +80,7 @@ def answer(now_ns: int, complete: bool, held: set[str], free: tuple[str, ...] = 
     return Answer(now_ns, now_ns, complete, (), 2, 0.1, frozenset(held), frozenset(free))
 
 
-def test_answers_are_held_against_what_stood_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answers_are_compared_with_the_scene(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, both = Scene(), {FIRST, SECOND}
     came_ns = 100 * NS_PER_S
     monkeypatch.setattr(site, "monotonic_ns", lambda: came_ns)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Peers that a master should not have, each kind at addresses of its own, until they are told to stop."""
+"""Misbehaving peers of a master, each kind with addresses of its own, until they are stopped."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ SLOW_HEADS, SLOW_BODIES, LARGE, GARBAGE, FLOODS = 100, 100, 4, 4, 8
 PER_ADDRESS = 20
 DRIP_S = 0.1
 PAUSE_S = 0.01
-"""Between two connections of one peer: together they ask for some 1,200 a second."""
+"""Time between two connections of one peer. Together the peers make some 1,200 requests a second."""
 
 HELD_BY_ONE = 80
-"""More than an address may have."""
+"""Connections of one address, above the limit."""
 
 Peer = Callable[["BadPeers", str], Awaitable[None]]
 
 
 @dataclass
 class BadPeers:
-    """A context in which they are at it; `seen` counts what they did, and what came of it."""
+    """A context in which the peers run. `seen` counts their actions and the results."""
 
     port: int
     token: str
@@ -67,7 +67,7 @@ class BadPeers:
 
     async def _again_and_again(self, peer: Peer, ip: str) -> None:
         while True:
-            # Whatever the master does to it, it comes back.
+            # The peer reconnects after any answer of the master.
             with suppress(OSError, asyncio.IncompleteReadError):
                 await peer(self, ip)
             self.seen[peer.__name__] += 1
@@ -95,7 +95,7 @@ async def slow_body(peers: BadPeers, ip: str) -> None:
 
 
 async def large(peers: BadPeers, ip: str) -> None:
-    """The largest update there may be, with a token that is right, for a unit that is another's."""
+    """Post the largest possible update with a valid token for a unit at another address."""
     keys = keys_to_bytes(np.arange(MAX_VOXELS, dtype=np.uint32))
     update = UpdateRequest(id=peers.others_id, session=0, sequence=2**40, sent_at_ns=0, versions=Versions(), keys=keys)
     body = encode_update(update)
@@ -120,7 +120,7 @@ async def garbage(peers: BadPeers, ip: str) -> None:
 
 
 async def flood(peers: BadPeers, ip: str) -> None:
-    """As many connections as there may be, and none of them says a word."""
+    """Open as many connections as possible, and send nothing."""
     held = []
     try:
         for _ in range(HELD_BY_ONE):
@@ -135,7 +135,7 @@ async def flood(peers: BadPeers, ip: str) -> None:
 
 @contextmanager
 def closed(writer: asyncio.StreamWriter) -> Iterator[None]:
-    """Aborts a connection in the end."""
+    """Abort a connection at the end."""
     try:
         yield
     finally:

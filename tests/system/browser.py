@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real browser without a screen, and all that it asked for and complained of."""
+"""A real headless browser, with all its requests and errors."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from tests.missing import missing
 WIDTH, HEIGHT = 1280, 800
 
 LOAD_MS = 90_000
-"""For the first picture: without a graphics card, and with two cores for everything, shaders take their time."""
+"""Time limit of the first image: without a graphics card, and with two cores for everything, shaders are slow."""
 
-# Without a graphics card WebGL is reckoned by SwiftShader.
+# Without a graphics card SwiftShader renders WebGL.
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 LOCAL_SCHEMES = ("data", "blob")
 
 OUT = os.environ.get("CELLWATCH_VIEWER_OUT")
-"""Where pictures are kept for people to look at."""
+"""Folder in which screenshots are kept for people."""
 
 
 def chromium() -> str:
-    """Where the browser is; without one a test is skipped, except where CI is set: there it fails."""
+    """Return the path of the browser. Without one a test is skipped; with CI set it fails."""
     path = shutil.which("chromium") or shutil.which("chromium-browser")
     if path is None:
         missing("no browser: expected Debian's chromium (scripts/system-packages installs it)")
@@ -43,19 +43,19 @@ def chromium() -> str:
 
 @dataclass
 class Witness:
-    """What a browser asked for, and what went wrong in it."""
+    """Requests of a browser, and its errors."""
 
     asked: list[str] = field(default_factory=list)
     errors: list[str] = field(default_factory=list)
 
     def watch(self, context: BrowserContext) -> None:
-        """Keep all of it from now on."""
+        """Record everything from now on."""
         context.on("request", lambda request: self.asked.append(request.url))
         context.on("console", lambda said: self.errors.append(said.text) if said.type == "error" else None)
         context.on("weberror", lambda error: self.errors.append(str(error.error)))
 
     def foreign(self, origin: str) -> list[str]:
-        """What was asked of anyone but `origin`."""
+        """Return the requests to any host but `origin`."""
         host = urlsplit(origin).netloc
         parts = [(url, urlsplit(url)) for url in self.asked]
         return [url for url, part in parts if part.scheme not in LOCAL_SCHEMES and part.netloc != host]
@@ -63,7 +63,7 @@ class Witness:
 
 @contextmanager
 def a_browser() -> Iterator[Browser]:
-    """Chromium, as Debian has it."""
+    """Start Debian's Chromium."""
     path = chromium()
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
@@ -74,7 +74,7 @@ def a_browser() -> Iterator[Browser]:
 
 
 def opened(context: BrowserContext, link: str) -> Page:
-    """The window, once it shows the table of units and a picture."""
+    """Return the window, once it shows the table of units and an image."""
     page = context.new_page()
     page.set_default_timeout(LOAD_MS)
     page.goto(link)
@@ -84,7 +84,7 @@ def opened(context: BrowserContext, link: str) -> Page:
 
 
 def shot(page: Page, name: str) -> NDArray[np.uint8]:
-    """What is on the screen now, (H, W, 3); kept as `name` where pictures are kept."""
+    """Return a screenshot (H, W, 3). It is kept as `name` if screenshots are kept."""
     data = page.screenshot()
     if OUT:
         folder = Path(OUT)

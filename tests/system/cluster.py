@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real master and real units as processes on loopback, and nothing left of them afterwards."""
+"""A real master and real units as processes on loopback, all of which end with the test."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ import numpy as np
 import yaml
 
 START_S = 30.0
-"""For a process to be there on a busy machine, kernels to be compiled included."""
+"""Time limit for a process to start on a busy machine, including the compilation of kernels."""
 
 STOP_S = 2.0
-"""What a service manager counts on."""
+"""Time limit to stop, on which a service manager relies."""
 
 Found = TypeVar("Found")
 
@@ -34,14 +34,14 @@ WALL_MM, PATCH_MM = 5000, 1500
 
 
 def write_cell(folder: Path) -> Path:
-    """A box without anything in it."""
+    """Write a cell with an empty box."""
     path = folder / "cell.yaml"
     path.write_text(yaml.safe_dump(CELL))
     return path
 
 
 def write_recording(folder: Path, focal_px: float = FOCAL_PX) -> Path:
-    """A patch of half a metre, 1.5 m before the camera; all else is far outside the cell."""
+    """Write a recording of a patch of half a metre, 1.5 m before the camera. All else is far outside the cell."""
     folder.mkdir()
     depth = np.full((HEIGHT, WIDTH), WALL_MM, np.uint16)
     half = round(20 * focal_px / FOCAL_PX)
@@ -53,7 +53,7 @@ def write_recording(folder: Path, focal_px: float = FOCAL_PX) -> Path:
 
 
 def until(look: Callable[[], Found], what: str, timeout_s: float = START_S) -> Found:
-    """What `look` finds, as soon as it finds anything; fails after `timeout_s`."""
+    """Return the first true result of `look`. Fail after `timeout_s`."""
     deadline = time.monotonic() + timeout_s
     while True:
         found = look()
@@ -65,7 +65,7 @@ def until(look: Callable[[], Found], what: str, timeout_s: float = START_S) -> F
 
 @dataclass
 class Cluster:
-    """Processes of one test; leaving the context ends them all."""
+    """Processes of one test. Leaving the context ends them all."""
 
     folder: Path
     cell: Path
@@ -92,7 +92,7 @@ class Cluster:
                 print(f"---- {log.name}\n{log.read_text()}")
 
     def start(self, name: str, *arguments: str, under: Sequence[str] = ()) -> subprocess.Popen[str]:
-        """A process of ours, as the last of the command `under`; its output goes to a log named after it."""
+        """Start a process, as the last part of the command `under`. Its output goes to a log named after it."""
         with (self.folder / f"{name}.log").open("a") as log:
             process = subprocess.Popen(
                 [*under, sys.executable, "-m", *arguments], stdout=log, stderr=subprocess.STDOUT, text=True
@@ -104,7 +104,7 @@ class Cluster:
         return (self.folder / f"{name}.log").read_text()
 
     def start_master(self, *options: str, under: Sequence[str] = ()) -> subprocess.Popen[str]:
-        """A master; started again, it listens at the same port. `under` may give it other mounts than ours."""
+        """Start a master; a restarted one listens at the same port. `under` may give it private mounts."""
         ready = self.folder / "ready.json"
         process = self.start(
             "master", "master_server", "--cell", str(self.cell), "--host", "127.0.0.1", "--port", str(self.port),
@@ -130,7 +130,7 @@ class Cluster:
         return process
 
     def start_unit(self, number: int, source: dict[str, Any], **more: Any) -> subprocess.Popen[str]:
-        """Unit `number`, at 127.0.0.(number + 1)."""
+        """Start unit `number`, at 127.0.0.(number + 1)."""
         config = {
             "source": source,
             "master_url": self.url,
@@ -154,7 +154,7 @@ class Cluster:
         return response.json() if response.content else None
 
     def states(self) -> dict[str, str]:
-        """The state of each unit by its address."""
+        """Return the state of each unit by its address."""
         return {row["ip"]: row["state"] for row in self.get("/units")}
 
     def until_live(self, count: int, timeout_s: float = START_S) -> None:
@@ -162,7 +162,7 @@ class Cluster:
 
 
 def stop(process: subprocess.Popen[str], number: signal.Signals) -> float:
-    """Tell a process to stop; returns how long it took."""
+    """Send a signal to a process, and return the seconds until it ended."""
     began = time.monotonic()
     process.send_signal(number)
     process.wait(START_S)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A network of our own: a switch, and hosts that are plugged into it, as namespaces that go with their last process."""
+"""A private network: a switch, and hosts plugged into it, as namespaces that end with their last process."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any
 
 HOLD = ("sh", "-c", "ip link set lo up && echo && read line")
-"""Tells that the namespace is there, and keeps it until we are gone."""
+"""Reports that the namespace exists, and keeps it until the test ends."""
 
 GET = """
 import json, sys, urllib.request
@@ -22,7 +22,7 @@ print(opener.open(sys.argv[1], timeout=2).read().decode())
 
 
 def run(*command: str) -> None:
-    """Run a command of the system; fails with what it says."""
+    """Run a command of the system. A failure shows its output."""
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, f"{' '.join(command)}: {ended.stderr}"
 
@@ -33,18 +33,18 @@ class Host:
 
     pid: int
     under: tuple[str, ...]
-    """Before a command, so that it runs there."""
+    """Prefix of a command that runs on this host."""
 
     def add(self, address: str) -> None:
-        """Give it an address, as DHCP would."""
+        """Add an address to the host, as DHCP would."""
         run(*self.under, "ip", "address", "add", f"{address}/24", "dev", "lan0")
 
     def drop(self, address: str) -> None:
-        """Take an address away."""
+        """Remove an address."""
         run(*self.under, "ip", "address", "del", f"{address}/24", "dev", "lan0")
 
     def get(self, url: str) -> Any:
-        """What is answered there, or None where nobody answers."""
+        """Return the answer at `url`, or None if there is none."""
         command = [*self.under, sys.executable, "-c", GET, url]
         ended = subprocess.run(command, capture_output=True, text=True, check=False)
         return json.loads(ended.stdout) if ended.returncode == 0 else None
@@ -52,7 +52,7 @@ class Host:
 
 @dataclass
 class Lan:
-    """Leaving the context takes all of it away."""
+    """A network. Leaving the context removes all of it."""
 
     holders: list[subprocess.Popen[str]] = field(default_factory=list)
 
@@ -71,7 +71,7 @@ class Lan:
             holder.communicate()
 
     def host(self, address: str | None = None, plugged: bool = True) -> Host:
-        """Another machine."""
+        """Add a machine."""
         holder = self._hold(*self._in(self._switch), "unshare", "--net")
         host = Host(holder.pid, self._in(holder))
         if plugged:
@@ -81,7 +81,7 @@ class Lan:
         return host
 
     def plug(self, host: Host) -> None:
-        """Plug its cable in."""
+        """Plug in the host's cable."""
         port, switch = f"port{host.pid}", self._in(self._switch)
         run(*switch, "ip", "link", "add", port, "type", "veth", "peer", "name", "lan0", "netns", str(host.pid))
         run(*switch, "ip", "link", "set", port, "master", "switch", "up")

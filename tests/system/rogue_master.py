@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m tests.system.rogue_master CELL CONTRACT FINGERPRINT` claims to be a master, and prints what it is told."""
+"""`python -m tests.system.rogue_master CELL CONTRACT FINGERPRINT` announces itself as a master, and prints all
+requests.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ PORT = 8420
 
 
 async def serve(says: Announcement) -> None:
-    """Take whatever comes."""
+    """Accept all requests."""
 
     async def take(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         print("was told", await reader.read(65536), flush=True)

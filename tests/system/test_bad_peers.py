@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real master among peers that mean it no good, while one unit works on."""
+"""A real master with misbehaving peers, while one unit works on."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ from tests.system.bad_peers import BadPeers
 from tests.system.cluster import Cluster, write_cell
 
 SECONDS, WARM_UP_S = 6.0, 1.0
-"""Longer than a head may take, so that slow senders are let go and come back meanwhile."""
+"""Longer than the timeout of a request's head, so that slow senders are dropped and reconnect meanwhile."""
 
 RATE_HZ = 30.0
 VOXELS = 500
 P99_MS_MAX = 100.0
-"""Of a unit's update among all of them, on a machine of two cores that carries the peers, too."""
+"""Round trip of a unit's update with all peers, on a machine of two cores that runs the peers, too."""
 
 GROWTH_MAX_BYTES = 64 * 2**20
-"""512 connections with what each has sent, and bodies of 1 MiB under way; without bounds it is that every second."""
+"""512 connections with the data of each, and bodies of 1 MiB in flight. Without bounds memory grows by as much every
+second.
+"""
 
 LOG_MAX_BYTES = 200_000
 
@@ -71,7 +73,7 @@ async def test_bad_peers_cost_a_unit_no_update(cluster: Cluster) -> None:
         while unit.poll() is None:
             most = max(most, master.memory_info().rss)
             await asyncio.sleep(0.1)
-        # The address is the operator's, and of none of them.
+        # The address is the operator's, not that of a peer.
         assert (await asyncio.to_thread(cluster.get, "/healthz"))["status"] == "ok"
     among = result(cluster, "among", unit)
     grown = most - before
@@ -83,6 +85,6 @@ async def test_bad_peers_cost_a_unit_no_update(cluster: Cluster) -> None:
     assert among["p99_ms"] < max(P99_MS_MAX, 10 * alone["p99_ms"])
     assert grown < GROWTH_MAX_BYTES
     assert log_bytes < LOG_MAX_BYTES
-    # All of them did what they should not, and nothing of it was taken.
+    # All peers misbehaved, and the master took nothing of it.
     assert all(peers.seen[kind] for kind in ("slow_head", "slow_body", "garbage", "flood", "403"))
     assert not peers.seen["200"]

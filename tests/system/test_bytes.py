@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an update costs on the wire, counted between a real client and a real master."""
+"""Size of an update on the wire, counted between a real client and a real master."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 
 class Counter:
-    """A proxy that counts the bytes of both ways."""
+    """A proxy that counts the bytes of both directions."""
 
     def __init__(self, port: int) -> None:
         self._port = port

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cell is changed while real units watch it: as an integrator would, with a zip and with curl."""
+"""The cell changes while real units watch it, as an integrator would change it: with a zip and with curl."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CORNER_M = [1.8, 1.8, 0.5]
 
 
 def cell_of(top_m: float, board_xyz: list[float]) -> dict[str, Any]:
-    """A box with a board that may be moved, and a crate whose mesh is a file."""
+    """Return a box with a movable board, and a crate whose mesh is a file."""
     return {
         "name": "changed",
         "box": {"min": [0.0, 0.0, 0.0], "max": [2.0, 2.0, top_m]},
@@ -50,7 +50,7 @@ def zipped(cell: dict[str, Any]) -> bytes:
 
 
 class Watcher(threading.Thread):
-    """Asks for the map all the time, and keeps what it said whenever it was complete."""
+    """Polls the map all the time, and records each complete one."""
 
     def __init__(self, cluster: Cluster) -> None:
         super().__init__()
@@ -100,7 +100,7 @@ def put_zip(cluster: Cluster, cell: dict[str, Any]) -> Any:
 
 
 def seen_of_patches(cluster: Cluster) -> tuple[int, int]:
-    """How many voxels stand before the first camera, and before the second."""
+    """Return the numbers of voxels before the first and the second camera."""
     centres = cluster.get("/voxels?form=centres")["voxels"]
     first = [c for c in centres if abs(c[1] - 0.5) < 0.06 and abs(c[0] - 1.0) < 0.3]
     second = [c for c in centres if abs(c[0] - 0.5) < 0.06 and abs(c[1] - 1.0) < 0.3]
@@ -123,7 +123,7 @@ def test_a_cell_in_a_zip_and_an_object_that_moves_reach_running_units(cluster: C
         assert after["lattice"]["shape"] == [40, 40, 32]
         assert min(seen_of_patches(cluster)) >= 80
 
-        # What stood before the first camera was the board: told so, it is no obstacle any more.
+        # The board stood before the first camera. Once it is known it is no obstacle.
         pose = from_xyz_rpy(BOARD_BEHIND_THE_PATCH["xyz"], (0.0, 0.0, 0.0)).tolist()
         moved = cluster.put("/cell/objects/board/pose", {"T_world_object": pose})
         assert (moved["versions"]["cell"], moved["versions"]["lattice"]) == (3, answer["versions"]["lattice"])
@@ -133,7 +133,7 @@ def test_a_cell_in_a_zip_and_an_object_that_moves_reach_running_units(cluster: C
         assert second >= 80
         assert [row["versions"]["cell"] for row in cluster.get("/units")] == [3, 3]
 
-        # A cell that is none leaves everything as it is.
+        # An invalid cell changes nothing.
         wrong = zipped({**cell_of(1.6, CORNER_M), "objekts": []})
         refused = cluster.operator.put("/cell", content=wrong, headers={"Content-Type": "application/zip"})
         assert refused.status_code == 422
@@ -143,7 +143,7 @@ def test_a_cell_in_a_zip_and_an_object_that_moves_reach_running_units(cluster: C
     whole = first + second
     numbers = [(version, shape) for version, shape, _ in watcher.complete]
     assert watcher.asked > 10
-    # Each lattice by itself, one after the other, and never a part of the voxels.
+    # Each lattice by itself, one after the other, and never only some of the voxels.
     assert numbers == sorted(numbers)
     assert set(numbers) == {(before["lattice_version"], (40, 40, 40)), (after["lattice_version"], (40, 40, 32))}
     assert {count for _, _, count in watcher.complete} == {len(before["voxels"]), len(after["voxels"]), whole}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo as a person runs it: what it tells, how it ends, and that nothing of it is left."""
+"""The demo as a person runs it: its output, its end, and no leftovers."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ import pytest
 pytestmark = pytest.mark.slow
 
 START_S = 240.0
-"""For kernels to be compiled on a busy machine, from nothing."""
+"""Time limit to compile all kernels on a busy machine."""
 
 STOP_S = 2.0
 
 BUSY_S = 2.0
-"""What a machine that does other things besides may add to that."""
+"""Additional time on a machine with other load."""
 
 FIGURES = {
     "units", "people", "resolution", "voxel_size_m", "seconds", "fps_per_unit", "frames", "frames_dropped",
@@ -36,7 +36,7 @@ FIGURES = {
 
 
 class RunningDemo:
-    """A demo in the background and what it has said."""
+    """A demo in the background and its output."""
 
     def __init__(self, *arguments: str) -> None:
         self.process = subprocess.Popen(
@@ -61,7 +61,7 @@ class RunningDemo:
                 return line
 
     def find_children(self, count: int) -> None:
-        """Wait until so many processes of the fleet run."""
+        """Wait until that many processes of the fleet run."""
         deadline = time.monotonic() + START_S
         while len(self.children) < count:
             assert self.process.poll() is None, self.said
@@ -71,7 +71,7 @@ class RunningDemo:
             self.children = [child for child in found if "simulation.fleet.warm_up" not in child.cmdline()]
 
     def end(self, number: signal.Signals | None = None) -> tuple[int, float]:
-        """Send a signal, if any; exit code and seconds until it had ended."""
+        """Send a signal, if any. Return the exit code and the seconds until the end."""
         began = time.monotonic()
         if number is not None:
             self.process.send_signal(number)
@@ -81,7 +81,7 @@ class RunningDemo:
         return code, took
 
     def left(self) -> list[str]:
-        """What still runs of its children after a moment."""
+        """Return its children that still run after a moment."""
         _, alive = psutil.wait_procs([child for child in self.children if not _is_over(child)], timeout=1.0)
         return [str(child) for child in alive if not _is_over(child)]
 
@@ -94,7 +94,7 @@ class RunningDemo:
 
 
 def _is_over(process: psutil.Process) -> bool:
-    """Gone, or dead and waiting for whoever inherited it."""
+    """Return True if the process is gone, or a zombie of its new parent."""
     try:
         return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
@@ -113,7 +113,7 @@ def running(*arguments: str) -> Iterator[RunningDemo]:
         demo.process.stdout.close()
 
 
-def test_it_ends_by_itself_and_tells_how_it_went() -> None:
+def test_it_ends_by_itself_and_prints_a_summary() -> None:
     with running("--seconds", "5", "--json") as demo:
         assert "http://127.0.0.1:" in demo.until_said("Cellwatch demo: ")
         demo.find_children(6)
@@ -124,14 +124,14 @@ def test_it_ends_by_itself_and_tells_how_it_went() -> None:
         assert demo.left() == []
 
     assert set(figures) == FIGURES
-    # Two cores that do other things besides may not keep to all that quiet ones do.
+    # Two cores with other load may miss limits that quiet ones keep.
     assert len(figures["fps_per_unit"]) == 4
     assert min(figures["fps_per_unit"]) >= 10.0
     assert figures["frames"] >= 4 * 5 * 10
     assert 200 < figures["voxels_mean"] < 5000
     assert 0.0 < figures["frame_ms_p50"] <= figures["frame_ms_p99"]
     assert 0.0 < figures["capture_to_map_ms_p50"] < 250.0
-    # These do not depend on how busy it is.
+    # These do not depend on the load.
     assert figures["frames_with_false_voxels"] <= 0.01 * figures["frames"]
     assert figures["missed_fraction"] <= 0.02
     assert figures["missed_fraction"] <= figures["missed_fraction_strict"] < 0.25
@@ -141,7 +141,7 @@ def test_it_ends_by_itself_and_tells_how_it_went() -> None:
 @pytest.mark.parametrize(
     ("number", "line"), [(signal.SIGINT, "2 of 2 units live"), (signal.SIGTERM, "0 of 2 units live")]
 )
-def test_it_stops_when_told_to(number: signal.Signals, line: str) -> None:
+def test_it_stops_on_a_signal(number: signal.Signals, line: str) -> None:
     with running("--units", "2", "--people", "0") as demo:
         demo.until_said(line)
         demo.find_children(4)
@@ -158,7 +158,7 @@ def test_nothing_is_left_when_it_is_killed() -> None:
         assert demo.left() == []
 
 
-def test_a_unit_that_dies_is_told_of() -> None:
+def test_a_dead_unit_is_reported() -> None:
     with running("--units", "2", "--people", "0") as demo:
         demo.until_said("2 of 2 units live")
         demo.find_children(4)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Units that were told nothing but a token find their master, on networks of their own with real processes."""
+"""Units with only a token find their master, on private networks with real processes."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ TOKEN = "a-token-for-every-unit-here"
 PORT = 8420
 
 MOVED_S = 8.0
-"""A master at a new address is found within a few seconds: 2 s until it is missed, its probing, a busy machine."""
+"""Time until a master at a new address is found: 2 s until it is missed, its probing, a busy machine."""
 
 LATE_S = 30.0
-"""A unit whose address comes after it began tries again every few seconds; the rest is for a busy machine."""
+"""A unit that gets its address after the start retries every few seconds; the rest is for a busy machine."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -45,7 +45,7 @@ class Site(Cluster):
     lan: Lan
 
     def master(self, name: str, host: Host, cell: str = "bench", *options: str) -> subprocess.Popen[str]:
-        """A master of a cell of this name; all take the same token."""
+        """Start a master of a cell of this name; all have the same token."""
         state, document = self.folder / name, self.folder / f"{name}.yaml"
         state.mkdir(exist_ok=True)
         (state / "unit.token").write_text(TOKEN)
@@ -56,7 +56,7 @@ class Site(Cluster):
         )  # fmt: skip
 
     def unit(self, name: str, host: Host, **more: Any) -> subprocess.Popen[str]:
-        """A unit that knows its token and where its camera is."""
+        """Start a unit that knows its token and the pose of its camera."""
         folder = self.folder / "frames"
         if not folder.exists():
             write_recording(folder)
@@ -72,7 +72,7 @@ class Site(Cluster):
         return self.start(name, "edge_unit", "run", str(path), under=host.under)
 
     def until_said(self, name: str, *words: str, timeout_s: float = 60.0) -> None:
-        """Until the log of a process has all these words, one after the other."""
+        """Wait until the log of a process has all these words in this order."""
 
         def said() -> bool:
             rest = self.log(name)
@@ -93,7 +93,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
 
 
 def live(host: Host, address: str) -> dict[str, tuple[str, str]]:
-    """Phase and state of each unit by its IP, as the master at `address` tells them."""
+    """Return phase and state of each unit by its IP, as reported by the master at `address`."""
     rows = host.get(f"http://{address}:{PORT}/units") or []
     return {row["ip"]: (row["phase"], row["state"]) for row in rows}
 
@@ -113,7 +113,7 @@ def test_a_unit_finds_its_master_and_follows_it_to_another_address(site: Site) -
     site.until_said("unit", *moved, timeout_s=MOVED_S)
     left_s = MOVED_S - (time.monotonic() - began)
     until(lambda: live(board, "10.78.0.50") == {"10.78.0.2": ("live", "live")}, "a live unit", left_s)
-    # Few lines, and one when it was missed.
+    # Few lines, and one for the lost master.
     assert len(site.log("unit").splitlines()) < 30
 
 
@@ -168,7 +168,7 @@ def test_of_two_masters_the_one_of_its_cell_is_taken_and_no_other_ever(site: Sit
     assert live(decided, "10.78.0.3") == {}
 
 
-def test_two_masters_of_one_cell_are_told_apart(site: Site) -> None:
+def test_two_masters_of_one_cell_are_distinguished(site: Site) -> None:
     one, two, board = site.lan.host("10.78.0.1"), site.lan.host("10.78.0.3"), site.lan.host("10.78.0.2")
     first, second = site.master("first", one), site.master("second", two)
     for name in ("first", "second"):
@@ -178,7 +178,7 @@ def test_two_masters_of_one_cell_are_told_apart(site: Site) -> None:
         site.until_said("unit", "2 masters would do", f"http://{address}:8420")
     stop(first, signal.SIGTERM)
     until(lambda: live(board, "10.78.0.3") == {"10.78.0.2": ("live", "live")}, "a live unit", 30.0)
-    # One that stands in for it: the same cell at another address.
+    # An impostor: the same cell at another address.
     site.master("first", one)
     site.until_said("first", "stopped", "announced as ")
     second.kill()
@@ -214,7 +214,7 @@ def test_a_master_on_the_same_board_is_found(site: Site, address: str | None) ->
     until(lambda: live(board, ip) == {ip: ("live", "live")}, "a live unit", 60.0)
 
 
-def test_doctor_tells_what_it_found_and_what_it_would_choose(site: Site) -> None:
+def test_doctor_prints_its_findings_and_its_choice(site: Site) -> None:
     desk, other, board = site.lan.host("10.78.0.1"), site.lan.host("10.78.0.3"), site.lan.host("10.78.0.2")
     site.master("ours", desk, "welding")
     site.master("theirs", other, "painting")

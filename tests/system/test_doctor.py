@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`edge-unit doctor` beside a real master."""
+"""`edge-unit doctor` with a real master."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
 
 
 def doctor(config: Path, *options: str) -> tuple[int, dict[str, str]]:
-    """Exit code, and the level of each finding."""
+    """Return the exit code, and the level of each finding."""
     command = [sys.executable, "-m", "edge_unit", "doctor", str(config), "--seconds", "1", *options]
     ended = subprocess.run(command, capture_output=True, text=True)
     lines = [line.split(maxsplit=2) for line in ended.stdout.splitlines()]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every fault of `make faults`, through the same code: nothing is called free that nobody sees, and nothing is lost."""
+"""Every fault of `make faults`, through the same code: nothing unseen is called free, and nothing is lost."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.missing import need_namespaces
 pytestmark = pytest.mark.slow
 
 BUSY_S = 1.0
-"""What other tests beside may add to a time; what is said of the map holds however busy the machine is."""
+"""Additional time because of other tests. The statements about the map hold on any machine, however busy."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -26,7 +26,7 @@ def namespaces() -> None:
 
 
 def struck(name: str) -> dict[str, Any]:
-    """The row of one fault."""
+    """Run one fault and return its row."""
     command = (sys.executable, "-m", "qualification.faults", name)
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.stdout, run.stderr
@@ -35,7 +35,7 @@ def struck(name: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
-def test_nothing_is_called_free_that_nobody_sees(fault: Any) -> None:
+def test_no_unseen_place_is_called_free(fault: Any) -> None:
     row = struck(fault.name)
     assert not row["false_free"], row
     assert row["lost"] == 0, row

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real master on a disk that is really full: a tmpfs of a megabyte, which only that process sees."""
+"""A real master on a really full disk: a tmpfs of one megabyte that only its process sees."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CLEARS_WITHIN_S = TRY_EVERY_S + 1.0
 
 
 def on_a_small_disk(folder: Path) -> tuple[str, ...]:
-    """The command under which a process finds an empty disk of a megabyte at `folder`."""
+    """Return the command that gives a process an empty disk of one megabyte at `folder`."""
     for unshare in NAMESPACES:
         under = (*unshare, "sh", "-c", MOUNT, str(folder))
         if not subprocess.run((*under, "true"), capture_output=True, check=False).returncode:
@@ -37,7 +37,7 @@ def on_a_small_disk(folder: Path) -> tuple[str, ...]:
 
 
 def fill(disk: Path) -> Path:
-    """A file that takes all that is left."""
+    """Write a file that takes all remaining space."""
     filler = disk / "filler"
     with filler.open("wb", buffering=0) as file:
         for _ in range(1000):
@@ -51,7 +51,7 @@ def fill(disk: Path) -> Path:
 
 
 def start(cluster: Cluster) -> Path:
-    """A master with a small disk; returns the disk as we see it."""
+    """Start a master with a small disk. Return the disk's path for this process."""
     state_dir = cluster.folder / "master"
     state_dir.mkdir()
     cluster.start_master(under=on_a_small_disk(state_dir))
@@ -93,7 +93,7 @@ async def test_changes_are_refused_and_all_else_goes_on_until_there_is_room(tmp_
             assert cluster.put("/settings", {"voxel_size_m": 0.1})["voxel_size_m"] == 0.1
             assert cluster.get("/healthz")["storage"] == "ok"
 
-            # And once more, with nobody who changes anything afterwards.
+            # Once more, without any change afterwards.
             filler = fill(disk)
             changes_are_refused(cluster)
             await asyncio.sleep(1.5 * TRY_EVERY_S)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a real master writes while it is used and misused: lines that can be collected, and never a token."""
+"""The log of a real master during use and misuse: lines that can be collected, and never a token."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A master, and processes that write to its store, killed in mid-write: what they acknowledged is there, and whole."""
+"""A master, and processes that write to its store, killed during a write: acknowledged data is present and whole."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ KILLS = 100
 
 MASTER_KILLS = 10
 STEP = 0.001
-"""Between one value that is written and the next."""
+"""Time between two written values."""
 STAY = 3
-"""Units that joined last and are not deleted yet."""
+"""Number of the newest units, which are not deleted yet."""
 
 WRITER = """
 import sys, threading
@@ -67,8 +67,8 @@ for thread in threads: thread.join()
 
 
 @pytest.mark.slow
-def test_what_a_killed_process_acknowledged_is_stored_and_nothing_is_half_written(tmp_path: Path) -> None:
-    """Kills (SIGKILL) a child that holds the store alone and has three writers; the master itself is not in it."""
+def test_acknowledged_writes_of_a_killed_process_are_stored_whole(tmp_path: Path) -> None:
+    """Kill (SIGKILL) a child that holds the store alone and has three writers. The master itself is not in it."""
     path = tmp_path / FILE_NAME
     dice = random.Random(1)
     highest = 0
@@ -97,7 +97,7 @@ def test_what_a_killed_process_acknowledged_is_stored_and_nothing_is_half_writte
         if saved.versions is not None:
             stored["settings 0"] = saved.versions.settings
             assert saved.settings["voxel_size_m"] == 0.01 + saved.versions.settings % 1000 * 1e-5
-        # One write may have come to its end without the word of it.
+        # One write may have finished without its acknowledgement.
         for name, version in acknowledged.items():
             assert version <= stored[name] <= max(version, highest) + 1
         highest = max(stored.values())
@@ -106,7 +106,7 @@ def test_what_a_killed_process_acknowledged_is_stored_and_nothing_is_half_writte
 
 @dataclass
 class Ledger:
-    """What one master acknowledged to writers of whom each waits for its answer; the next may have been stored, too."""
+    """Acknowledgements of one master to writers that each wait for their answer. The next write may be stored, too."""
 
     units: dict[str, int] = field(default_factory=dict)
     poses: dict[int, int] = field(default_factory=dict)
@@ -119,7 +119,7 @@ class Ledger:
     count: int = 0
 
     def hear(self, what: str) -> None:
-        """An answer came."""
+        """Record an answer."""
         self.heard.add(what)
         self.count += 1
 
@@ -129,7 +129,7 @@ def at(step: int) -> list[list[float]]:
 
 
 class Writers:
-    """All who change something at one master, at once and each from an address of its own, until it is gone."""
+    """All writers to one master, in parallel and each from an address of its own, until the master is gone."""
 
     def __init__(self, cluster: Cluster, ledger: Ledger) -> None:
         self._cluster = cluster
@@ -143,7 +143,7 @@ class Writers:
         return httpx.AsyncClient(base_url=self._cluster.url, headers=headers, transport=transport)
 
     async def join(self, ip: str) -> int:
-        """A unit comes; returns its id."""
+        """Register a unit and return its id."""
         introduction = FakeUnit(master(), ip, f"S{ip}").introduction(monotonic_ns())
         async with self.client(ip, self._unit) as client:
             response = await client.post("/initialize", content=encode(introduction))
@@ -200,7 +200,7 @@ class Writers:
                 ledger.unsure = set()
 
     async def write_until(self, kill: Callable[[], None], wait_s: float) -> None:
-        """Write; once everyone was answered, `kill` comes after `wait_s`."""
+        """Write. Once every writer has an answer, call `kill` after `wait_s`."""
         works = [self.pose(number) for number in self._ledger.poses]
         works += [self.settings(), self.object(), self.come_and_go()]
         kinds = len(works) + 1
@@ -226,7 +226,7 @@ async def _until_gone(work: Coroutine[Any, Any, None]) -> None:
 
 
 def check(cluster: Cluster, ledger: Ledger) -> None:
-    """Whether all that was acknowledged is there; what was under way is taken over as it is."""
+    """Check that all acknowledged data is present. Data in flight is accepted as it is."""
     rows = {row["ip"]: row for row in cluster.get("/units")}
     by_id = {row["id"]: row for row in rows.values()}
     for number, step in ledger.poses.items():
@@ -250,7 +250,7 @@ def check(cluster: Cluster, ledger: Ledger) -> None:
 
 
 @pytest.mark.slow
-async def test_what_a_killed_master_acknowledged_is_there_in_the_next(tmp_path: Path) -> None:
+async def test_acknowledged_changes_of_a_killed_master_survive(tmp_path: Path) -> None:
     dice = random.Random(2)
     box = {"name": "box", "box": [0.2, 0.2, 0.2]}
     path = tmp_path / "cell.yaml"

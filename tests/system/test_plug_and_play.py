@@ -57,7 +57,7 @@ def test_another_camera_has_no_pose_until_it_finds_its_own(played: dict[str, Any
 
 
 @pytest.mark.parametrize("what", ["knocked", "covered"])
-def test_a_worthless_view_is_told_and_counts_for_nothing(played: dict[str, Any], what: str) -> None:
+def test_a_worthless_view_is_reported_and_does_not_count(played: dict[str, Any], what: str) -> None:
     found = played[what]
     assert found["seconds_to_notice"] <= NOTICE_S_MAX + BUSY_S
     before, meanwhile = found["seen_share"]

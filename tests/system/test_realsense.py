@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real unit with a RealSense camera that hangs, dies, is unplugged and is not there, as its master sees it."""
+"""A real unit with a RealSense camera that hangs, dies, is unplugged and is absent, as its master sees it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.edge_unit.sources.realsense import recordings
 from tests.system.cluster import Cluster, until, write_cell
 
 NOTICED_S = 1.0
-"""The master knows that a camera is in trouble within this time."""
+"""The master reports a camera failure within this time."""
 
 POSE = {"xyz": [1.0, -1.0, 1.0], "rpy_deg": [-90.0, 0.0, 0.0]}
 
@@ -41,7 +41,7 @@ def row(cluster: Cluster) -> dict[str, Any]:
 
 
 def until_row(cluster: Cluster, wanted: Callable[[dict[str, Any]], bool], what: str, timeout_s: float) -> float:
-    """Seconds until the unit's row is as wanted."""
+    """Return the seconds until the unit's row is as wanted."""
     began = time.monotonic()
     until(lambda: wanted(row(cluster)), what, timeout_s)
     return time.monotonic() - began
@@ -56,7 +56,7 @@ def start_pluggable(cluster: Cluster, sockets: Path) -> subprocess.Popen[str]:
     unit = cluster.start_unit(1, {"kind": "realsense", "serial": "SYN0001"}, T_world_camera=POSE)
     unit.kill()
     unit.wait()
-    # The same configuration, in the hands of a unit with other sockets.
+    # The same configuration, for a unit with other sockets.
     return cluster.start("pluggable", "tests.system.pluggable_unit", str(sockets), str(cluster.folder / "unit1.yaml"))
 
 
@@ -75,7 +75,7 @@ def test_a_hung_camera_is_known_within_a_second_and_a_killed_unit_leaves_nothing
     until_row(cluster, lambda it: it["state"] == "live", "recovery", 10.0)
     assert row(cluster)["frame_number"] > first
 
-    # Its memory has no name that could be left behind.
+    # Its shared memory has no name that could be left behind.
     assert "memfd:cellwatch-frames (deleted)" in Path(f"/proc/{unit.pid}/maps").read_text()
     capture = capture_of(unit)
     unit.kill()
@@ -95,7 +95,7 @@ def test_an_unplugged_camera_is_known_within_a_second_and_comes_back(
     plug(sockets, [recording])
     until_row(cluster, lambda it: it["state"] == "live", "recovery", 10.0)
 
-    # It starts without its camera: the master is told which one is missing all the same.
+    # The unit starts without its camera, and the master still reports the missing serial.
     unit.kill()
     unit.wait()
     cluster.operator.delete(f"/units/{row(cluster)['id']}").raise_for_status()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real processes: a master records for five seconds, is stopped or killed, and its recording answers in its place."""
+"""Real processes: a master records for five seconds and is stopped or killed; then its recording is served."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def start_replay(cluster: Cluster, file: str, *options: str) -> subprocess.Popen
 
 
 def comparable(voxels: dict[str, Any]) -> dict[str, Any]:
-    """What must be the same whenever it is asked: ages pass, a patch does not."""
+    """Return the parts that are the same at any time: ages change, a patch does not."""
     return {
         key: voxels[key] for key in ("lattice", "voxels", "witnesses", "complete", "reasons", "units_live", "unseen")
     }
@@ -53,7 +53,7 @@ def comparable(voxels: dict[str, Any]) -> dict[str, Any]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_what_was_recorded_is_served_again(cluster: Cluster, number: signal.Signals) -> None:
+def test_a_recording_is_served_again(cluster: Cluster, number: signal.Signals) -> None:
     folder = cluster.folder / "recordings"
     master = cluster.start_master("--record", str(folder))
     source = {"kind": "recorded", "folder": str(write_recording(cluster.folder / "images")), "fps": 15.0, "loop": True}
@@ -77,7 +77,7 @@ def test_what_was_recorded_is_served_again(cluster: Cluster, number: signal.Sign
     assert stands["playing"]
     assert stands["speed"] == 2.0
     assert stands["duration_s"] >= SECONDS - 1.0
-    # A moment before the end, for the last one may be that of a unit that was stopped.
+    # A moment before the end, because the last frame may be that of a stopped unit.
     cluster.put("/replay", {"position_s": stands["duration_s"] - 1.0, "playing": False})
     assert comparable(cluster.get("/voxels?unseen=true")) == then
     assert cluster.get("/cell") == cell
@@ -86,7 +86,7 @@ def test_what_was_recorded_is_served_again(cluster: Cluster, number: signal.Sign
     assert {key: row[key] for key in ("id", "ip", "serial", "state", "T_world_camera")} == {
         key: units[0][key] for key in ("id", "ip", "serial", "state", "T_world_camera")
     }
-    # A unit that still runs is told what it has found, and nothing of it gets in.
+    # A running unit is refused with a reason, and nothing of it is stored.
     assert cluster.operator.put("/settings", json={"voxel_size_m": 0.03}).status_code == 409
 
     cluster.put("/replay", {"position_s": stands["duration_s"] - 3.0, "playing": True})
@@ -107,7 +107,7 @@ def test_what_was_recorded_is_served_again(cluster: Cluster, number: signal.Sign
 
 
 async def heard(cluster: Cluster, count: int) -> list[Any]:
-    """So many messages of the stream."""
+    """Return that many messages of the stream."""
     url = f"{cluster.url.replace('http', 'ws', 1)}/stream?encoding=json"
     headers = {"Authorization": cluster.operator.headers["Authorization"]}
     async with connect(url, additional_headers=headers) as socket:

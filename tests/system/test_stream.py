@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real master, units that are nothing but HTTP, and readers of `/stream` who must not be left in the dark."""
+"""A real master, units that consist only of HTTP requests, and readers of `/stream` that must stay informed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PERIOD_S = 1.0 / 30.0
 
 
 class HttpUnit:
-    """Registers and reports like a unit does, from an address of its own."""
+    """Registers and reports like a unit, from an address of its own."""
 
     def __init__(self, cluster: Cluster, number: int) -> None:
         self.ip = f"127.0.0.{number + 1}"
@@ -95,13 +95,13 @@ async def until_complete(reader: ClientConnection, *voxels: int) -> None:
         pass
 
 
-async def test_units_that_fall_silent_are_told_at_their_moment_though_nobody_posts(cluster: Cluster) -> None:
+async def test_silent_units_are_reported_in_time_without_any_post(cluster: Cluster) -> None:
     async with two_units(cluster) as (first, second), reader_of(cluster) as reader:
         await first.update(1)
         await second.update(2)
         await until_complete(reader, 1, 2)
         last = await first.update(1)
-        # The first one is dead from here on; the second reports on, and then nobody does.
+        # The first unit is dead from here on; the second still reports, and later stops, too.
         while (message := await heard(reader))["complete"]:
             await second.update(2)
         assert last.captured_at_ns is not None
@@ -134,7 +134,7 @@ async def test_from_capture_to_reader_within_a_frame(cluster: Cluster) -> None:
         assert sorted(delays_s)[len(delays_s) // 2] < PERIOD_S
 
 
-async def test_readers_who_do_not_read_cost_no_memory(cluster: Cluster) -> None:
+async def test_readers_that_do_not_read_cost_no_memory(cluster: Cluster) -> None:
     process = psutil.Process(cluster.processes[0].pid)
     async with two_units(cluster) as (first, _), reader_of(cluster) as reader:
         wall = range(5000)
@@ -148,7 +148,7 @@ async def test_readers_who_do_not_read_cost_no_memory(cluster: Cluster) -> None:
         for step in range(200):
             await first.update(step % 100, *wall[100:])
             await heard(reader)
-        # Kept, these would be 8 readers x 200 messages x 20 kB = 32 MB.
+        # If kept, these would be 8 readers x 200 messages x 20 kB = 32 MB.
         assert process.memory_info().rss - before < 8 * 2**20
         for connection in deaf:
             connection.transport.abort()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real master that speaks TLS, and units that believe it or do not."""
+"""A real master with TLS, and units that trust it or do not."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_older_tls_and_none_get_no_answer(lasting: Cluster) -> None:
 
 
 class Rogue(http.server.BaseHTTPRequestHandler):
-    """Stands where the master stood, with a certificate of its own."""
+    """A server in the master's place, with a certificate of its own."""
 
     requests: ClassVar[list[str]] = []
 
@@ -140,7 +140,7 @@ class Rogue(http.server.BaseHTTPRequestHandler):
         return
 
 
-def test_a_unit_tells_a_rogue_master_nothing_and_returns_to_its_own(cluster: Cluster) -> None:
+def test_a_unit_sends_a_rogue_master_nothing_and_returns_to_its_own(cluster: Cluster) -> None:
     source = {"kind": "recorded", "folder": str(write_recording(cluster.folder / "frames")), "fps": 15, "loop": True}
     unit = cluster.start_unit(
         1, source, T_world_camera={"xyz": [1.0, 1.0, 0.5]}, master_fingerprint=fingerprint(cluster)
@@ -197,7 +197,7 @@ def test_a_unit_that_checks_does_not_even_start_with_a_plain_master(tmp_path: Pa
         ("certificate.pem", None, "expected tls_certificate and tls_key"),
     ],
 )
-def test_what_is_no_certificate_is_named(tmp_path: Path, certificate: str, key: str | None, words: str) -> None:
+def test_an_invalid_certificate_is_named(tmp_path: Path, certificate: str, key: str | None, words: str) -> None:
     folder, cell = write_certificates(tmp_path), write_cell(tmp_path)
     options = ["--tls-certificate", str(folder / certificate)] + (["--tls-key", str(folder / key)] if key else [])
     command = [sys.executable, "-m", "master_server", "--cell", str(cell), "--port", "0", *options]

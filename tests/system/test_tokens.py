@@ -20,7 +20,7 @@ COUNTS_WITHIN_S = 1.0
 
 
 def replace(cluster: Cluster, role: str) -> str:
-    """A new token by the command line; returns it."""
+    """Replace a token on the command line and return the new one."""
     state_dir = Path(cluster.unit_token_file).parent
     command = (sys.executable, "-m", "master_server", "new-token", role, "--state-dir", str(state_dir))
     printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
@@ -42,7 +42,7 @@ def listen(cluster: Cluster, token: str) -> ClientConnection:
 
 
 def closed_with(reader: ClientConnection) -> int | None:
-    """Why the master closes, after whatever it still says."""
+    """Read to the end, and return the close code of the master."""
     with suppress(ConnectionClosed):
         while True:
             reader.recv(timeout=COUNTS_WITHIN_S)
@@ -68,7 +68,7 @@ def test_the_units_token_is_replaced_while_all_runs(tmp_path: Path) -> None:
         assert httpx.get(cluster.url + "/units", headers=bearer(new)).status_code == 200
         until(lambda: "401: unknown token" in cluster.log("unit1"), "the refusal in the unit's log", 5.0)
         until(lambda: not cluster.get("/voxels")["complete"], "that the unit is missed", 5.0)
-        # It asks on and on with what it has, and has it read again each time.
+        # The unit retries with its token, and reads the file again each time.
         own.write_text(new + "\n")
         put_at = time.monotonic()
         cluster.until_live(1, 5.0)
@@ -83,7 +83,7 @@ def test_the_units_token_is_replaced_while_all_runs(tmp_path: Path) -> None:
         assert new not in logs
 
 
-def test_the_operators_token_is_replaced_and_a_spoiled_file_shuts_nobody_out(tmp_path: Path) -> None:
+def test_the_operators_token_is_replaced_and_a_damaged_file_keeps_the_old_one(tmp_path: Path) -> None:
     with Cluster(tmp_path, write_cell(tmp_path)) as cluster:
         master = cluster.start_master()
         file = Path(cluster.unit_token_file).with_name("operator.token")
@@ -100,7 +100,7 @@ def test_the_operators_token_is_replaced_and_a_spoiled_file_shuts_nobody_out(tmp
         assert cluster.operator.put("/settings", json={"voxel_size_m": 0.1}).status_code == 401
         cluster.operator.headers.update(bearer(new))
         assert cluster.put("/settings", {"voxel_size_m": 0.1})
-        # What lies there is what the next master begins with.
+        # The next master starts with the stored state.
         master.kill()
         master.wait()
         (tmp_path / "ready.json").unlink()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real processes over HTTP: what the map says while units come, go, and are told to change."""
+"""Real processes over HTTP: the map while units come, go, and change."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.system.cluster import STOP_S, Cluster, stop, until, write_cell, write
 
 PERIOD_S = 1.0 / 15.0
 
-# Beside the box looking along +y, and along +x; the patch of each stands 0.5 m inside.
+# One camera beside the box looks along +y, the other along +x; the patch of each stands 0.5 m inside.
 LOOKING_ALONG_Y = {"xyz": [1.0, -1.0, 1.0], "rpy_deg": [-90.0, 0.0, 0.0]}
 LOOKING_ALONG_X = {"xyz": [-1.0, 1.0, 1.0], "rpy_deg": [-90.0, 0.0, -90.0]}
 
@@ -36,7 +36,7 @@ def source(cluster: Cluster, **more: Any) -> dict[str, Any]:
 
 
 def start_two(cluster: Cluster) -> list[Any]:
-    """A master and two live units that each see another patch."""
+    """Start a master and two live units that each see another patch."""
     cluster.start_master()
     first = cluster.start_unit(1, source(cluster, serial="ONE"), T_world_camera=LOOKING_ALONG_Y)
     second = cluster.start_unit(2, source(cluster, serial="TWO"), T_world_camera=LOOKING_ALONG_X)
@@ -63,7 +63,7 @@ def test_two_units_make_one_map_and_a_dead_one_is_missed(cluster: Cluster) -> No
     killed_at = time.monotonic()
     first.kill()
     view = until(lambda: (now := cluster.get("/voxels?form=centres"))["complete"] is False and now, "noticed", 5.0)
-    # One query more, since this process looks on a busy machine.
+    # One additional request, because this process polls on a busy machine.
     assert time.monotonic() - killed_at < 0.5 + PERIOD_S + 0.2
     assert {tuple(centre) for centre in view["voxels"]} == of_second
     assert view["units_live"] == 1
@@ -117,7 +117,7 @@ def test_a_wrong_token_is_refused_until_it_is_right(cluster: Cluster) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_both_stop_at_once_when_told_to(cluster: Cluster, number: signal.Signals) -> None:
+def test_both_stop_at_once_on_a_signal(cluster: Cluster, number: signal.Signals) -> None:
     master = cluster.start_master()
     unit = cluster.start_unit(1, source(cluster), T_world_camera=LOOKING_ALONG_Y)
     cluster.until_live(1)
@@ -152,7 +152,7 @@ def test_background_is_learned_on_request_and_dropped_again(cluster: Cluster) ->
     cluster.until_live(1)
     unit_id = cluster.get("/units")[0]["id"]
     assert cluster.operator.post(f"/units/{unit_id}/background").status_code == 202
-    # What stands there all the time is background from now on.
+    # Everything static is background from now on.
     until(lambda: cluster.states() == {"127.0.0.2": "live"} and cluster.get("/voxels")["voxels"] == [], "learned", 20.0)
     assert cluster.operator.delete(f"/units/{unit_id}/background").status_code == 202
     until(lambda: len(cluster.get("/voxels")["voxels"]) >= 80, "dropped", 5.0)
@@ -168,7 +168,9 @@ def test_background_is_learned_on_request_and_dropped_again(cluster: Cluster) ->
         ({"fsp_max": 3}, "fsp_max"),
     ],
 )
-def test_a_unit_that_cannot_start_says_why_in_one_line(cluster: Cluster, config: dict[str, Any], words: str) -> None:
+def test_a_unit_that_cannot_start_prints_the_reason_in_one_line(
+    cluster: Cluster, config: dict[str, Any], words: str
+) -> None:
     token_file = cluster.folder / "token"
     token_file.write_text("some-token-0123456789")
     unit = cluster.start_unit(1, **{"source": source(cluster), "token_file": str(token_file), **config})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The operator's window in a real browser, before a real master and real units."""
+"""The operator's window in a real browser, with a real master and real units."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 LOOKING_ALONG_Y = {"xyz": [1.0, -1.0, 1.0], "rpy_deg": [-90.0, 0.0, 0.0]}
 LOOKING_ALONG_X = {"xyz": [-1.0, 1.0, 1.0], "rpy_deg": [-90.0, 0.0, -90.0]}
 FOCALS_PX = {1: 120.0, 2: 200.0}
-"""Of a wide camera and a narrow one."""
+"""Focal lengths of a wide camera and a narrow one."""
 
 SEEN_S = 40.0
-"""Until a change is on a screen that is painted without a graphics card on a busy machine."""
+"""Time limit of a change on the screen, rendered without a graphics card on a busy machine."""
 
 GONE_S = 5.0
-"""For what was told to end."""
+"""Time limit for a stopped process to end."""
 
 VISER = Subprotocol("viser-v1.1.1")
 
 
 class TerminalCluster(Cluster):
-    """A cluster whose master believes that a person reads what it prints."""
+    """A cluster whose master believes that its output is a terminal."""
 
     def start(self, name: str, *arguments: str, under: Sequence[str] = ()) -> subprocess.Popen[str]:
         if name != "master":
@@ -67,7 +67,7 @@ class TerminalCluster(Cluster):
         return process
 
     def printed_link(self) -> str:
-        """The link that the master has printed."""
+        """Return the link that the master has printed."""
         said = ""
         while (found := re.search(r"drawn at (\S+/viewer/login#\S+)", said)) is None:
             said += os.read(self.terminal, 4096).decode()
@@ -76,7 +76,7 @@ class TerminalCluster(Cluster):
 
 @pytest.fixture(scope="module", autouse=True)
 def nothing_left_running() -> Iterator[None]:
-    """In place of the guard of each test, for browser and cluster live as long as this module."""
+    """Replace the guard of each test, because browser and cluster live as long as this module."""
     before = set(psutil.Process().children(recursive=True))
     yield
     _, alive = psutil.wait_procs(set(psutil.Process().children(recursive=True)) - before, timeout=GONE_S)
@@ -117,7 +117,7 @@ def page(cluster: TerminalCluster, browser: Browser, witness: Witness) -> Iterat
 
 
 def on_screen(page: Page, points_m: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Pixels (N, 2) x, y of world points (N, 3), as one who has just come sees them."""
+    """Return the pixels (N, 2) x, y of world points (N, 3), in the initial view."""
     eye, target = view_of(*(np.array(CELL["box"][corner]) for corner in ("min", "max")))
     rect = page.evaluate("() => document.querySelector('canvas').getBoundingClientRect().toJSON()")
     seen = apply(inverse(look_at(eye, target)), points_m)
@@ -127,24 +127,24 @@ def on_screen(page: Page, points_m: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def is_obstacle(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Pixels in the hues of obstacles: red above green above blue, by far."""
+    """Return the pixels in the hues of obstacles: red above green above blue, by far."""
     red, green, blue = (picture[..., i].astype(int) for i in range(3))
     return (red > 90) & (red - green > 30) & (green - blue > 8) | (red - green > 80) & (red - blue > 80)
 
 
 def count_of(picture: NDArray[np.uint8], state: str, place: NDArray[np.int64]) -> int:
-    """Pixels around a place (x, y) in the colour of a state."""
+    """Return the number of pixels around a place (x, y) in the colour of a state."""
     (x, y), reach = place, 90
     around = picture[max(y - reach, 0) : y + reach, max(x - reach, 0) : min(x + reach, 885)]
     return int((np.abs(around.astype(int) - STATE_COLOURS[state]).max(axis=2) < 40).sum())
 
 
 def until_shown(page: Page, look: Callable[[NDArray[np.uint8]], bool], what: str) -> NDArray[np.uint8]:
-    """The first picture in which `look` finds what it looks for."""
+    """Return the first screenshot for which `look` is true."""
     pictures: list[NDArray[np.uint8]] = []
 
     def found() -> bool:
-        # Its own events are handled meanwhile.
+        # The browser's own events are processed meanwhile.
         page.wait_for_timeout(300)
         pictures[:] = [shot(page, what)]
         return look(pictures[0])
@@ -186,7 +186,7 @@ def test_obstacles_are_drawn_where_they_are(cluster: TerminalCluster, page: Page
 
 
 def is_unit_2(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Pixels in the hue of what unit 2 alone reports, which no other thing has."""
+    """Return the pixels in the hue of voxels of unit 2 alone, which nothing else has."""
     red, green, blue = (picture[..., i].astype(int) for i in range(3))
     return (green - red > 50) & (blue - red > 45)
 
@@ -196,7 +196,7 @@ def choose(page: Page, label: str, option: str) -> None:
     page.get_by_role("option", name=option, exact=True).click()
 
 
-def test_colours_tell_the_unit_for_who_wants_it(cluster: TerminalCluster, page: Page) -> None:
+def test_colours_show_the_unit_on_demand(cluster: TerminalCluster, page: Page) -> None:
     legend = page.locator('[data-cellwatch="legend"]')
     expect(legend).to_contain_text("2 units")
     places = on_screen(page, np.array(cluster.get("/voxels?form=centres")["voxels"]))
@@ -214,7 +214,7 @@ def test_colours_tell_the_unit_for_who_wants_it(cluster: TerminalCluster, page: 
 
 
 def range_lines(page: Page, row: dict[str, Any], intrinsics: dict[str, Any]) -> NDArray[np.int64]:
-    """Pixels (N, 2) along the edges of what a unit's camera would look through with these intrinsics."""
+    """Return the pixels (N, 2) along the edges of a unit camera's view with these intrinsics."""
     edges = view_edges(Intrinsics(**intrinsics), row["range_m"]).astype(np.float64)
     steps = np.linspace(0.5, 1.0, 60)[:, None, None]
     points = (edges[:4, 0] * (1.0 - steps) + edges[:4, 1] * steps).reshape(-1, 3)
@@ -223,7 +223,7 @@ def range_lines(page: Page, row: dict[str, Any], intrinsics: dict[str, Any]) -> 
 
 
 def share_lined(picture: NDArray[np.uint8], places: NDArray[np.int64]) -> float:
-    """Share of the places at which, or beside which, there is the light green of a live camera's range."""
+    """Return the share of the places that have, or adjoin, the light green of a live camera's range."""
     red, green, blue = (picture[..., i].astype(int) for i in range(3))
     is_green = (green - red > 18) & (green - blue > 12)
     near = [is_green[places[:, 1] + y, places[:, 0] + x] for x in (-2, -1, 0, 1, 2) for y in (-2, -1, 0, 1, 2)]
@@ -287,7 +287,7 @@ def test_pictures_are_shown_on_request(cluster: TerminalCluster, page: Page) -> 
     expect(page.get_by_text("measured, expected; below: what remains")).to_be_visible()
 
 
-def test_what_nobody_sees_is_drawn_for_who_wants_it(page: Page) -> None:
+def test_unseen_blocks_are_drawn_on_demand(page: Page) -> None:
     page.get_by_role("checkbox", name="space that nobody sees").check(force=True)
 
     def is_violet(picture: NDArray[np.uint8]) -> bool:
@@ -318,7 +318,7 @@ def test_a_unit_that_dies_turns_its_frustum_and_its_row(cluster: TerminalCluster
     assert count_of(killed, "live", others) > 60
 
 
-def test_a_unit_is_forgotten_only_once_it_is_confirmed(cluster: TerminalCluster, page: Page) -> None:
+def test_a_unit_is_deleted_only_after_confirmation(cluster: TerminalCluster, page: Page) -> None:
     (victim,) = [unit for unit in cluster.get("/units") if unit["state"] == "stale"]
     choose(page, "unit", f"{victim['id']} · {victim['ip']}")
     page.get_by_role("button", name="Forget this unit").click()
@@ -399,7 +399,7 @@ def test_no_tunnel_is_opened_to_anywhere(cluster: TerminalCluster) -> None:
                 }
             )
         )  # fmt: skip
-        # What comes after it is answered: the camera that makes the talker one who looks.
+        # The message after it is answered: the camera message makes the client a viewer.
         said = b""
         while b"Settings" not in said:
             said = unpacked(talker.recv(timeout=SEEN_S))
@@ -409,7 +409,7 @@ def test_no_tunnel_is_opened_to_anywhere(cluster: TerminalCluster) -> None:
 
 
 def unpacked(data: bytes | str) -> bytes:
-    """The part of viser's message that is no array."""
+    """Return the part of viser's message that is no array."""
     import zstandard
 
     assert isinstance(data, bytes)
@@ -433,7 +433,7 @@ def test_another_pages_socket_is_refused(cluster: TerminalCluster) -> None:
         assert refused.value.response.status_code == status
 
 
-def test_its_own_port_tells_nobody_anything(cluster: TerminalCluster) -> None:
+def test_its_own_port_reveals_nothing(cluster: TerminalCluster) -> None:
     with socket(cluster, additional_headers=headers(cluster)) as talker:
         talker.recv(timeout=SEEN_S)
         (port,) = {found.laddr.port for found in viewer_process(cluster).net_connections() if found.status == "LISTEN"}
@@ -507,7 +507,7 @@ def test_a_recording_is_played_in_the_same_window(tmp_path: Path, browser: Brows
 
 
 def test_the_demo_shows_itself_and_a_unit_without_power(browser: Browser) -> None:
-    # A browser that draws without a graphics card needs a core for itself: few frames of few cameras leave it one.
+    # A browser without a graphics card needs a core for itself: few frames of few cameras leave it one.
     with running("--units", "2", "--fps", "5") as demo:
         link = demo.until_said("watch it in a browser: ").split("browser: ")[1].split(" ")[0]
         demo.until_said("2 of 2 units live")

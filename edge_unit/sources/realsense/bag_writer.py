@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of depth images becomes a recording that the RealSense SDK plays: `edge-unit record-images DIR OUT.db3`.
+"""Converts a folder of depth images to a recording of the RealSense SDK: `edge-unit record-images DIR OUT.db3`.
 
-Played through the `realsense` source it gives the same depth, bit for bit, with the same intrinsics and depth scale.
-A recording carries no joints; they are written to a file beside it, OUT.joints.csv, for the source's `joints_file`.
+Played through the `realsense` source it gives the same depth, bit for bit, with the same intrinsics and depth scale. A
+recording carries no joints; they are written to a file beside it, OUT.joints.csv, for the source's `joints_file`.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from shared.clock import NS_PER_S, monotonic_ns
 from shared.errors import CellwatchError, SourceError
 
 DEFAULT_FPS = 15.0
-"""A recording is played at the pace at which it was written, so it is written at a camera's."""
+"""A recording plays at the rate at which it was written, so it is written at a camera's rate."""
 
 
 def record_images(images: RecordedSourceConfig, path: Path, fps: float = DEFAULT_FPS) -> int:
-    """Write the images to `path` (.db3), at `fps` frames a second; returns how many there were.
+    """Write the images to `path` (.db3), at `fps` frames a second; returns their number.
 
-    Joints that the images carry go to `joints_path(path)`. A process of its own does it, so that the SDK cannot harm
-    this one.
+    Joints of the images go to `joints_path(path)`. A separate process does the work, so that the SDK cannot harm this
+    one.
 
     Raises:
-        SourceError: an image cannot be read, or the recording cannot be written; names the file.
+        SourceError: an image cannot be read, or the recording cannot be written; the text names the file.
     """
     command = (
         sys.executable,
@@ -51,12 +51,12 @@ def record_images(images: RecordedSourceConfig, path: Path, fps: float = DEFAULT
 
 
 def joints_path(recording: Path) -> Path:
-    """Where the joints of a recording lie: row i is of frame number i + 1."""
+    """Return the file of a recording's joints: row i belongs to frame number i + 1."""
     return recording.with_suffix(".joints.csv")
 
 
 def played(images: RecordedSourceConfig, recording: Path) -> RealsenseSourceConfig:
-    """What plays `recording` as `record_images` wrote it: each frame once, in the order of `images`."""
+    """Return the source that plays `recording` of `record_images`: each frame once, in the order of `images`."""
     joints = joints_path(recording)
     return RealsenseSourceConfig(
         recording=recording,
@@ -96,7 +96,7 @@ async def _record(images: RecordedSourceConfig, path: Path, fps: float) -> int:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The recording process: a source configuration as JSON, the file, and the rate."""
+    """Run the recording process: a source configuration as JSON, the file, and the rate."""
     images, path, fps = arguments
     try:
         count = asyncio.run(_record(RecordedSourceConfig.model_validate_json(images), Path(path), float(fps)))

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A camera's time stamps on this machine's CLOCK_MONOTONIC, its drift followed.
+"""Conversion of a camera's time stamps to this machine's CLOCK_MONOTONIC; follows the drift between the clocks.
 
-Two things are known of the shift between the clocks. A frame never arrives before it is taken, so the frame that
-arrived fastest bounds the shift from above; how long that fastest frame was under way, it does not tell. And where
-the camera's clock can be read, a reading between two of ours tells the shift to within half the time it took. The
-second is used as long as both agree, for such readings are sometimes wrong by seconds on a crowded bus.
+Two facts limit the shift between the clocks. First, a frame never arrives before its capture, so the fastest frame
+bounds the shift from above; its travel time stays unknown. Second, if the camera's clock can be read, a reading between
+two of the unit's own gives the shift to within half the time that it took. The second is used as long as both agree,
+as such readings are sometimes wrong by seconds on a crowded bus.
 
-The SDK does the like with the wall clock; we do it with the monotonic one, which is never set.
+The SDK does the same with the wall clock. Here it is the monotonic clock, which is never set.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ WRAP_NS = 2**32 * NS_PER_US
 """A RealSense counts microseconds in 32 bits: 71.6 minutes."""
 
 LATENCY_MAX_NS = 300 * NS_PER_MS
-"""More than the fastest of many frames was ever seen to take from exposure to our hands."""
+"""An upper bound: the fastest of many frames never took longer from exposure to arrival."""
 
 JUMP_NS = 50 * NS_PER_MS
-"""Frames all later than the fastest one by more than this speak of a clock that was set back ..."""
+"""If all frames are later than the fastest one by more than this, the camera's clock was set back ..."""
 
 JUMP_CONFIRMED_NS = 5 * NS_PER_S
-"""... when it lasts so long; load alone lets a fast one through now and then."""
+"""... when it lasts this long; under load alone, a fast frame comes now and then."""
 
 
 class CameraClock:
-    """Where a time of the camera lies on our clock. Pure: it is told all times, and reads none itself.
+    """Converts times of the camera to the unit's clock. Pure: the caller passes all times, and no clock is read.
 
-    `latency_ns` is what the fastest frame is taken to need when the camera's clock cannot be read. `wraps` tells that
-    its clock begins anew after `WRAP_NS`.
+    `latency_ns` is the assumed travel time of the fastest frame if the camera's clock cannot be read. `wraps` means
+    that its clock restarts after `WRAP_NS`.
     """
 
     def __init__(self, latency_ns: int, *, wraps: bool = False) -> None:
@@ -45,9 +45,9 @@ class CameraClock:
         self._suspect: ClockOffset | None = None
 
     def compare(self, asked_ns: int, camera_ns: int, answered_ns: int) -> None:
-        """Take in a reading of the camera's clock that was made between two readings of ours.
+        """Add a reading of the camera's clock, made between two readings of the unit's.
 
-        A reading that contradicts all before it is believed only when the next one bears it out.
+        A reading that contradicts all earlier ones counts only if the next one confirms it.
         """
         camera_ns = self._unwrapped(camera_ns)
         reading = Exchange(asked_ns, camera_ns, camera_ns, answered_ns)
@@ -60,14 +60,14 @@ class CameraClock:
         jumps = self._offset.jumps
         self._offset.add(reading)
         if self._offset.jumps > jumps:
-            # Frames of before tell nothing of the clock as it is set now.
+            # Earlier frames do not describe the new setting of the clock.
             self._fastest = None
 
     def captured_at_ns(self, camera_ns: int, arrived_ns: int) -> int:
-        """When a frame with the camera's stamp `camera_ns` was taken, by our clock; never after `arrived_ns`."""
+        """Return the capture time of a frame with stamp `camera_ns`, by the unit's clock; at most `arrived_ns`."""
         camera_ns = self._unwrapped(camera_ns)
         if self._fastest is None or self._newest_ns is None or camera_ns < self._newest_ns:
-            # The first frame, or a clock that began anew.
+            # The first frame, or the clock restarted.
             self._fastest = _Fastest(arrived_ns - camera_ns, arrived_ns)
         self._newest_ns = camera_ns
         self._fastest.add(arrived_ns - camera_ns, arrived_ns)
@@ -75,17 +75,17 @@ class CameraClock:
 
     @property
     def measured(self) -> bool:
-        """Whether the way from the camera to us is measured, not assumed."""
+        """True if the travel time from the camera is measured, not assumed."""
         return self._trusted_shift_ns() is not None
 
     def _shift_ns(self, arrived_ns: int) -> int:
-        """Our clock less the camera's."""
+        """The unit's clock less the camera's."""
         assert self._fastest is not None
         shift_ns = self._trusted_shift_ns()
         return self._fastest.shift_ns - self._latency_ns if shift_ns is None else shift_ns
 
     def _trusted_shift_ns(self) -> int | None:
-        """As the readings tell, where the fastest frame bears them out."""
+        """Return the shift by the readings, if the fastest frame confirms them."""
         if self._fastest is None or not self._offset.known:
             return None
         slack_ns = self._offset.uncertainty_ns(self._fastest.at_ns)
@@ -93,7 +93,7 @@ class CameraClock:
         return -self._offset.offset_ns if -slack_ns <= latency_ns <= LATENCY_MAX_NS + slack_ns else None
 
     def _unwrapped(self, camera_ns: int) -> int:
-        """The time whose counter this is that lies nearest to the newest one."""
+        """Return the time with this counter that is closest to the newest one."""
         if not self._wraps or self._newest_ns is None:
             return camera_ns
         return camera_ns + round((self._newest_ns - camera_ns) / WRAP_NS) * WRAP_NS
@@ -101,7 +101,7 @@ class CameraClock:
 
 @dataclass
 class _Fastest:
-    """The smallest shift seen, forgotten as fast as two clocks can drift apart."""
+    """The smallest shift seen; it ages as fast as two clocks can drift apart."""
 
     shift_ns: int
     at_ns: int

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Captures one stream: finds the camera, streams, and ends when anything goes wrong, telling all of it over the link.
+"""Captures one stream: finds the camera, streams, ends on any failure, and reports all of it over the link.
 
-For a process of its own (`capture_process`); there is one way to recover from whatever happens: the next process.
+It runs in a process of its own (`capture_process`). The only recovery from any failure is a new process.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns
 from shared.errors import SourceEnded, SourceError
 
 READ_S = 0.1
-"""How long one wait for a frame may be; then whoever listens is told that we live."""
+"""Limit of one wait for a frame; then the reader gets a sign of life."""
 
 ALIVE_EVERY_NS = 100 * NS_PER_MS
 
 FIRST_FRAME_S = 6.0
-"""From the start of the stream: cameras settle their exposure first, some for seconds."""
+"""Time for the first frame of a stream: cameras settle their exposure first, some for seconds."""
 
 SILENCE_S = 2.0
 SILENCE_PERIODS = 4
-"""Without a frame, once they came: the stream is stuck, and waiting was never seen to help."""
+"""Time without a frame after the first: the stream is stuck, and waiting longer was never seen to help."""
 
 CUT_SHORT_S = 0.5
-"""Left at the end of a recording: far more than lies between its last frame and its end."""
+"""Remaining time at the end of a recording: far more than the gap between its last frame and its end."""
 
 
 class Capture:
-    """One run: from looking for the camera to whatever ends it."""
+    """One run: from the search for the camera to its end or failure."""
 
     def __init__(self, end: socket.socket, request: link.Request, context: rs.context) -> None:
         self._end = end
@@ -50,40 +50,40 @@ class Capture:
         self._told_ns = 0
 
     def run(self) -> None:
-        """Capture until stopped. All that goes wrong is told over the link."""
+        """Capture until stopped. Each failure is reported over the link."""
         threading.Thread(target=self._listen, name="link", daemon=True).start()
         try:
-            self._tell(link.Phase("waiting"))
+            self._send(link.Phase("waiting"))
             device = self._wait_for_device()
             if device is not None:
                 if self._request.reset:
-                    self._tell(link.Phase("resetting"))
+                    self._send(link.Phase("resetting"))
                     device = self._devices.reset(device)
-                self._tell(link.Phase("starting"))
+                self._send(link.Phase("starting"))
                 self._stream(SdkStream(device, self._request))
         except SourceEnded:
-            self._tell(link.Ended())
+            self._send(link.Ended())
         except RecordingBroken as error:
-            self._tell(link.Failed(str(error), final=True))
+            self._send(link.Failed(str(error), final=True))
         except SourceError as error:
-            self._tell(link.Failed(str(error), unplugged=isinstance(error, Unplugged)))
+            self._send(link.Failed(str(error), unplugged=isinstance(error, Unplugged)))
 
     def _wait_for_device(self) -> Any:
-        """The device, or None when there is no more need of it."""
+        """Return the device, or None if it is no longer needed."""
         told = ""
         while not self._stop.is_set():
             device, reason = self._devices.find()
             if device is not None:
                 return device
             if reason != told:
-                self._tell(link.Phase("waiting", reason))
+                self._send(link.Phase("waiting", reason))
                 told = reason
             self._alive()
             self._devices.wait()
         return None
 
     def _stream(self, stream: SdkStream) -> None:
-        """Pass frames on until there are no more, or nobody wants any."""
+        """Pass frames on until the stream ends or the reader stops."""
         opened = stream.start()
         shape: tuple[int, ...] = (opened.height, opened.width)
         shape += (opened.channels,) if opened.channels > 1 else ()
@@ -121,12 +121,12 @@ class Capture:
         link.offer(self._end, link.Delivered())
         with self._taken:
             while self._request.lockstep and self._taken_number < number and not self._stop.is_set():
-                # The reader may be busy for long; what was offered may have been lost.
+                # The reader may be busy for long, and the earlier message may be lost.
                 if not self._taken.wait(READ_S):
                     link.offer(self._end, link.Delivered())
 
     def _check_complete(self, left_out_s: float, last: int) -> None:
-        """The SDK ends a recording without a word where it cannot read on."""
+        """Raise SourceError if the recording ended early: the SDK does not report a recording that it cannot read."""
         if left_out_s > CUT_SHORT_S:
             raise RecordingBroken(
                 f"{self._request.recording}: cannot be read beyond frame {last}, "
@@ -138,11 +138,11 @@ class Capture:
             self._told_ns = monotonic_ns()
             link.offer(self._end, link.Alive())
 
-    def _tell(self, message: link.Message) -> None:
+    def _send(self, message: link.Message) -> None:
         link.send(self._end, message)
 
     def _listen(self) -> None:
-        """Hear what the other end says, and go when it is gone: even a main thread that hangs then goes along."""
+        """Receive messages, and exit when the other end is gone: this ends even a process with a hung main thread."""
         while (received := link.receive(self._end)) is not None:
             message, _ = received
             with self._taken:
@@ -155,7 +155,7 @@ class Capture:
 
 
 def serve(end: socket.socket) -> None:
-    """Do what the first message of the link asks for."""
+    """Serve the first message of the link."""
     context = rs.context()
     received = link.receive(end)
     request = received[0] if received is not None else None

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a capture process is asked, and what it tells: a message a packet, over a socket that ends with either side.
+"""Messages to and from a capture process: one message a packet, over a socket that closes with either side.
 
-Both ends are this program, so a message is trusted; one that cannot be read is a bug. Frames do not pass here: they
-lie in shared memory, whose file descriptor travels with `Opened`. Kept free of heavy imports, since the capture
-process is begun anew whenever the camera makes trouble.
+Both ends are this program, so messages are trusted; an unreadable one is a bug. Frames do not pass here: they lie in
+shared memory, whose file descriptor travels with `Opened`. Heavy imports are avoided, as the capture process restarts
+at each failure of the camera.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, TypeAlias
 
 MAX_PACKET_BYTES = 65536
-"""Of one message; a survey of ten cameras with all their profiles takes a quarter of it."""
+"""Size limit of one message; a survey of ten cameras with all their profiles takes a quarter of it."""
 
 PhaseName = Literal["booting", "waiting", "resetting", "starting", "streaming", "stopping"]
 Stream = Literal["depth", "infrared", "color"]
@@ -23,11 +23,11 @@ Stream = Literal["depth", "infrared", "color"]
 
 @dataclass(frozen=True)
 class Request:
-    """What to capture. `serial` and `recording` are empty when not given; `reset` asks for a hardware reset first.
+    """The stream to capture. `serial` and `recording` are empty if not given; `reset` requests a hardware reset first.
 
-    A recording goes on after the frame `resume_after`, at the position `resume_at_ns`; what it delivers is numbered
-    from `number_base`.
-    `lockstep` delivers each frame, and waits until it was taken.
+    A recording resumes after the frame `resume_after`, at the position `resume_at_ns`; its frames are numbered from
+    `number_base`.
+    `lockstep` delivers each frame, and waits until the reader has taken it.
     """
 
     stream: Stream = "depth"
@@ -47,24 +47,24 @@ class Request:
 
 @dataclass(frozen=True)
 class Survey:
-    """Asks what is there, instead of capturing: answered by `Found`, and that is all."""
+    """Request a list of the cameras, without capture; the only answer is `Found`."""
 
 
 @dataclass(frozen=True)
 class Taken:
-    """The reader has the frame of this number; in lockstep the next may come."""
+    """The reader took the frame of this number; in lockstep the next may follow."""
 
     number: int
 
 
 @dataclass(frozen=True)
 class Stop:
-    """Leave the camera as it should be left, and end."""
+    """Leave the camera in its proper state, and end."""
 
 
 @dataclass(frozen=True)
 class Phase:
-    """What the process is about to do; each phase has a patience of its own."""
+    """The next step of the process; each phase has its own time limit."""
 
     name: PhaseName
     reason: str = ""
@@ -72,20 +72,20 @@ class Phase:
 
 @dataclass(frozen=True)
 class Alive:
-    """Nothing new, but not stuck."""
+    """A sign of life without news."""
 
 
 @dataclass(frozen=True)
 class Delivered:
-    """A new frame lies in shared memory."""
+    """A new frame in shared memory."""
 
 
 @dataclass(frozen=True)
 class Opened:
-    """The stream runs. The descriptor of the shared memory comes along.
+    """The stream runs. The descriptor of the shared memory travels with this message.
 
-    `distortion` has five numbers, `rotation` nine by rows and `translation_m` three: of this stream's frame into the
-    depth camera's. `stereo_baseline_m` is 0 where the camera does not tell.
+    `distortion` has five numbers. `rotation` (nine, by rows) and `translation_m` (three) map this stream's frame to the
+    depth camera's. `stereo_baseline_m` is 0 if the camera does not report it.
     """
 
     stream: Stream
@@ -112,14 +112,14 @@ class Opened:
 
 @dataclass(frozen=True)
 class Ended:
-    """The recording has come to its end."""
+    """The end of the recording."""
 
 
 @dataclass(frozen=True)
 class Failed:
-    """Capture cannot go on; to begin anew would end the same way when it is `final`, and is no matter of course if not.
+    """Capture failed; a new process would fail in the same way if `final`.
 
-    `unplugged` tells that nothing is wrong but the plug.
+    `unplugged` means that only the plug is the cause.
     """
 
     reason: str
@@ -149,7 +149,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(packet: bytes) -> Message:
-    """The message in a packet."""
+    """Decode the message in a packet."""
     values = json.loads(packet)
     kind = KINDS[values.pop("")]
     assert values.keys() == {field.name for field in fields(kind)}
@@ -158,12 +158,12 @@ def decode(packet: bytes) -> Message:
 
 
 def pair() -> tuple[socket.socket, socket.socket]:
-    """Two ends of a link; packets keep their borders, and the death of one end is seen at the other."""
+    """Return two ends of a link; packets keep their borders, and each end detects the death of the other."""
     return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 
 
 def send(end: socket.socket, message: Message, descriptor: int | None = None) -> None:
-    """Send a message that must arrive, with an open file if there is one; waits while the other end is behind.
+    """Send a message that must arrive, with an open file if given; waits while the other end is slow.
 
     Raises:
         OSError: the other end is gone.
@@ -173,7 +173,7 @@ def send(end: socket.socket, message: Message, descriptor: int | None = None) ->
 
 
 def offer(end: socket.socket, message: Message) -> bool:
-    """Send a message that may as well be lost; never waits. Returns whether it was sent.
+    """Send a message that may be lost; never waits. Returns True if it was sent.
 
     Raises:
         OSError: the other end is gone.
@@ -186,10 +186,10 @@ def offer(end: socket.socket, message: Message) -> bool:
 
 
 def receive(end: socket.socket) -> tuple[Message, int | None] | None:
-    """The next message and the open file that came along; None when the other end is gone.
+    """Receive the next message and its open file; None if the other end is gone.
 
     Raises:
-        BlockingIOError: there is none, and `end` does not wait.
+        BlockingIOError: there is no message, and `end` does not block.
     """
     try:
         packet, descriptors, _, _ = socket.recv_fds(end, MAX_PACKET_BYTES, 1)

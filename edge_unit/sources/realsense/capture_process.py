@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process in which cameras are captured: it alone loads the RealSense SDK.
+"""The process that captures cameras: only it loads the RealSense SDK.
 
-The SDK may hang for good in any call, or take its process down; here it can be killed. Whoever began the process reads
-from the link what it does, and it never outlives the link.
+The SDK may hang forever in any call, or crash its process; a separate process can be killed. Its parent reads its
+progress from the link, and the process never outlives the link.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PR_SET_PDEATHSIG = 1
 
 
 def serve(end: socket.socket) -> None:
-    """Do what the link asks for."""
+    """Serve the link."""
     from edge_unit.sources.realsense.capture import serve
 
     serve(end)
@@ -29,10 +29,10 @@ def serve(end: socket.socket) -> None:
 
 def main(descriptor: int, parent: int, serve: Callable[[socket.socket], None] = serve) -> NoReturn:
     """Serve the link behind `descriptor`, for as long as the process `parent` lives."""
-    # Whoever began this ends it, by the link; a Ctrl-C or a stop of the whole service is not for us to act on.
+    # The parent ends this process by the link; Ctrl-C, or a stop of the whole service, is not handled here.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    # The link's end is seen by a thread; should the SDK hang with Python's lock in its hands, the kernel does it.
+    # A thread detects the end of the link; if the SDK hangs while it holds the GIL, the kernel ends the process.
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     end = socket.socket(fileno=descriptor)
     if os.getppid() != parent:
@@ -42,15 +42,15 @@ def main(descriptor: int, parent: int, serve: Callable[[socket.socket], None] = 
         link.send(end, link.Phase("booting"))
         serve(end)
     except (BrokenPipeError, ConnectionResetError):
-        pass  # whoever began this is gone
+        pass  # the parent is gone
     except ImportError as error:
         text = (
-            f"the RealSense SDK cannot be loaded: {error}; it takes the packages pyrealsense2 and libusb-package "
-            "(pip install 'cellwatch[realsense]'; the system's libusb will do as well: apt-get install libusb-1.0-0)"
+            f"the RealSense SDK cannot be loaded: {error}; install the packages pyrealsense2 and libusb-package "
+            "(pip install 'cellwatch[realsense]'; the system's libusb also works: apt-get install libusb-1.0-0)"
         )
         link.send(end, link.Failed(text, final=True))
         status = 1
-    except Exception as error:  # a bug, or an error that the SDK was never seen to raise: tell it, show it, go
+    except Exception as error:  # a bug, or an error that the SDK was never seen to raise: report it, show it, end
         link.send(end, link.Failed(f"{type(error).__name__}: {error}"))
         sys.excepthook(type(error), error, error.__traceback__)
         status = 1

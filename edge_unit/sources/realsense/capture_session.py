@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One capture process in the hands of the unit: begun, listened to, and gone for certain afterwards."""
+"""Handle of one capture process in the unit: starts it, receives its messages, and makes sure that it ends."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from shared.errors import SourceError
 from shared.waiting import within
 
 CAPTURE_COMMAND = (sys.executable, "-m", "edge_unit.sources.realsense.capture_process")
-"""Takes the descriptor of its end of the link and the id of the process that it must not outlive."""
+"""Takes the descriptor of its end of the link and the id of its parent, which it must not outlive."""
 
 STOP_S = 1.0
-"""For a process that was asked to leave the camera as it should be left."""
+"""Time for a stopped process to leave the camera in its proper state."""
 
 KILL_S = 2.0
-"""For the kernel to let go of a killed process; one that it holds in a driver is left to it."""
+"""Time for the kernel to end a killed process; one that hangs in a driver is left behind."""
 
 MAX_MESSAGES = 1000
-"""Unread; a process tells some twenty a second, and whoever listens does so ten times a second."""
+"""Unread messages; a process sends some twenty a second, and the unit reads ten times a second."""
 
 
 class CaptureSession:
-    """A running capture process. `heard` is set whenever something new was heard of it, its end included."""
+    """A running capture process. `heard` is set at each new message, and at its end."""
 
     def __init__(self, process: asyncio.subprocess.Process, end: socket.socket) -> None:
         self._process = process
@@ -42,14 +42,14 @@ class CaptureSession:
         self.heard = asyncio.Event()
         self.gone = False
         self.frames: SharedFrames | None = None
-        """Where its frames lie, once `Opened` was heard."""
+        """Its shared frames, after `Opened`."""
         asyncio.get_running_loop().add_reader(end, self._read)
 
     @classmethod
     async def begin(
         cls, request: link.Request | link.Survey, command: Sequence[str] = CAPTURE_COMMAND
     ) -> CaptureSession:
-        """Start a process, and ask it.
+        """Start a process, and send it the request.
 
         Raises:
             SourceError: it cannot be started.
@@ -63,10 +63,10 @@ class CaptureSession:
                     str(theirs.fileno()),
                     str(os.getpid()),
                     pass_fds=(theirs.fileno(),),
-                    # A process of its own group: what the terminal sends to us is ours to pass on.
+                    # A process group of its own: the unit itself passes on the terminal's signals.
                     start_new_session=True,
                     stdin=asyncio.subprocess.DEVNULL,
-                    # It computes nothing; a pool of threads would only make it slow to start.
+                    # It computes nothing; thread pools would only slow down its start.
                     env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
                 )
             except BaseException as error:
@@ -75,7 +75,7 @@ class CaptureSession:
                     raise SourceError(f"the capture process cannot be started: {error}") from error
                 raise
         session = cls(process, ours)
-        session.tell(request)
+        session.send(request)
         return session
 
     @property
@@ -83,31 +83,31 @@ class CaptureSession:
         """The id of the process."""
         return self._process.pid
 
-    def tell(self, message: link.Message) -> None:
-        """Say something to it; it is gone if it does not hear."""
+    def send(self, message: link.Message) -> None:
+        """Send it a message; a process that cannot receive is gone."""
         with suppress(OSError):
             link.offer(self._end, message)
 
     def message(self) -> link.Message | None:
-        """What it said next; None when there is nothing new."""
+        """Return its next message; None if there is none."""
         return self._messages.popleft() if self._messages else None
 
     async def wait(self, timeout_s: float) -> None:
-        """Until something new is heard, but no longer than `timeout_s`."""
+        """Wait for a new message, at most `timeout_s`."""
         await within(timeout_s, self.heard.wait())
         self.heard.clear()
 
     async def stop(self) -> None:
-        """Ask it to end in good order, and see that it does."""
-        self.tell(link.Stop())
+        """Stop it in good order, and make sure that it ends."""
+        self.send(link.Stop())
         await within(STOP_S, self._process.wait())
         await self.kill()
 
     async def kill(self) -> str:
-        """End it whatever it does; returns how it ended, for a person."""
+        """Kill it in any state; returns a text on how it ended, for a person."""
         self._close()
         if self._process.returncode is None:
-            # Not by the process object: it would reap the process under asyncio's hands.
+            # Not by the process object, which would reap the process before asyncio does.
             with suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
         await within(KILL_S, self._process.wait())
@@ -117,12 +117,12 @@ class CaptureSession:
         return f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
 
     async def ended(self) -> str:
-        """How a process that has closed its link ended."""
+        """Return a text on how a process ended that has closed its link."""
         await within(STOP_S, self._process.wait())
         return await self.kill()
 
     def _read(self) -> None:
-        """Take in all that has come."""
+        """Receive all waiting messages."""
         while True:
             try:
                 received = link.receive(self._end)

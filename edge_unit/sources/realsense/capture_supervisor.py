@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keeps one stream coming: a capture process is begun, watched, and begun anew whenever it fails.
+"""Keeps one stream running: starts a capture process, watches it, and restarts it after each failure.
 
-All of it runs in the event loop and never blocks it; whatever hangs, hangs in the other process.
+All of it runs in the event loop and never blocks it; only the other process can hang.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from shared.waiting import within
 logger = logging.getLogger(__name__)
 
 TICK_S = 0.1
-"""Between two looks at the process; what it says is heard at once."""
+"""Time between two checks of the process; its messages are received at once."""
 
 LATE_NS = NS_PER_S
-"""When this program itself stood still for so long, nobody is called stuck for it."""
+"""If this program itself did not run for so long, no process is called stuck for it."""
 
-LOOKING = "it takes pictures of the calibration board, and no depth meanwhile"
+LOOKING = "it takes images of the calibration board, and no depth meanwhile"
 
 FRUITLESS_MAX = 2
-"""A recording that twice in a row brought no frame will not bring any."""
+"""A recording that twice in a row delivered no frame will not deliver any."""
 
 
 class CaptureSupervisor:
@@ -44,7 +44,7 @@ class CaptureSupervisor:
         flowing: SourceState = "live",
         command: Sequence[str] = CAPTURE_COMMAND,
     ) -> None:
-        """`flowing` is the state to be posted on `board` while frames come."""
+        """`flowing` is the state to post on `board` while frames come."""
         self._request = request
         self._board = board
         self._flowing: SourceState = flowing
@@ -58,22 +58,22 @@ class CaptureSupervisor:
         self._fruitless = 0
         self._known = asyncio.Event()
         self.news = asyncio.Event()
-        """Set when there may be a new frame, or when there will be none."""
+        """Set on a possible new frame, and at the end."""
         self.opened: link.Opened | None = None
         self.finished = False
-        """No process will be begun any more: it was closed, the recording ended, or `failure` tells why."""
+        """True if no process will be started any more: closed, the recording ended, or `failure` has the reason."""
         self.failure: Exception | None = None
 
     def begin(self) -> None:
-        """Begin in the background, or go on behind the last frame that was taken."""
+        """Start in the background, or resume after the last frame that was taken."""
         self._board.post("starting")
         self._task = asyncio.create_task(self._run())
 
     async def first_opened(self, timeout_s: float) -> link.Opened:
-        """The camera, once it streams.
+        """Return the camera, once it streams.
 
         Raises:
-            SourceError: it does not within `timeout_s`; says why.
+            SourceError: it does not stream within `timeout_s`; the text has the reason.
         """
         await within(timeout_s, self._known.wait())
         if self.failure is not None:
@@ -84,7 +84,7 @@ class CaptureSupervisor:
         return self.opened
 
     def take(self) -> SharedFrame | None:
-        """The newest frame, if it was not taken yet; the one taken before is given up with that."""
+        """Return the newest frame, if it was not taken yet; this releases the frame taken before."""
         after = self._request.number_base if self._taken is None else self._taken.number
         frame = None if self._frames is None else self._frames.take(after)
         if frame is not None:
@@ -99,14 +99,14 @@ class CaptureSupervisor:
 
     @property
     def pid(self) -> int | None:
-        """The id of the capture process that runs now."""
+        """The id of the current capture process."""
         return None if self._session is None else self._session.pid
 
     async def frames(self) -> AsyncIterator[SharedFrame]:
-        """Frames as they come, each valid until the next is asked for; ends with the recording, or when closed.
+        """Yield frames as they come, each valid until the next is requested; ends with the recording, or on `close`.
 
         Raises:
-            SourceError: there will be no more.
+            SourceError: there will be no more frames.
         """
         while True:
             self.news.clear()
@@ -120,14 +120,14 @@ class CaptureSupervisor:
                 await self.news.wait()
 
     async def pause(self) -> None:
-        """End the process, so that the camera is free for another use; `begin` goes on."""
+        """End the process, so that the camera is free for another use; `begin` resumes."""
         task, self._task = self._task, None
         if task is not None:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
 
     async def close(self) -> None:
-        """End the process and all that belongs to it."""
+        """End the process and release all its resources."""
         await self.pause()
         self._finish()
         self._frames = None
@@ -146,13 +146,13 @@ class CaptureSupervisor:
                 if failed.final or (request.recording and self._fruitless >= FRUITLESS_MAX):
                     raise SourceError(failed.reason)
                 restart = self._watchdog.end(unplugged=failed.unplugged)
-                logger.warning("%s; capture begins anew in %g s", failed.reason, restart.delay_s)
+                logger.warning("%s; capture restarts in %g s", failed.reason, restart.delay_s)
                 self._board.post("restarting", failed.reason)
                 await asyncio.sleep(restart.delay_s)
                 request = replace(self._continued(), reset=restart.reset and not request.recording)
         except SourceError as error:
             self._fail(error)
-        except Exception as error:  # a bug of ours: whoever reads the frames shall see it
+        except Exception as error:  # a bug: the reader of the frames must see it
             self._fail(error)
             raise
         self._finish()
@@ -168,7 +168,7 @@ class CaptureSupervisor:
         self.news.set()
 
     def _continued(self) -> link.Request:
-        """The request that goes on behind the last frame taken."""
+        """Return the request that resumes after the last frame taken."""
         taken = self._taken
         if taken is None:
             return self._request
@@ -182,7 +182,7 @@ class CaptureSupervisor:
         )
 
     async def _capture(self, request: link.Request) -> link.Failed | None:
-        """One process from begin to end; returns what went wrong, None when nothing is left to be done."""
+        """Run one process to its end; returns the failure, None if nothing is left to do."""
         session = self._session = await CaptureSession.begin(request, self._command)
         looked_ns = monotonic_ns()
         self._watchdog.begin(looked_ns)
@@ -197,8 +197,8 @@ class CaptureSupervisor:
                         return None
                     if isinstance(message, link.Failed):
                         return message
-                    self._hear(message, session, now_ns)
-                self._look_for_frames(now_ns)
+                    self._receive(message, session, now_ns)
+                self._check_for_frame(now_ns)
                 if session.gone:
                     return link.Failed(f"the capture process was ended by {await session.ended()}")
                 if not late:
@@ -212,14 +212,14 @@ class CaptureSupervisor:
             self._session = None
             await session.kill()
 
-    def _hear(self, message: link.Message, session: CaptureSession, now_ns: int) -> None:
+    def _receive(self, message: link.Message, session: CaptureSession, now_ns: int) -> None:
         if isinstance(message, link.Opened):
             self._watchdog.stream(now_ns, message.fps)
             self._accept(message)
             self._frames = session.frames
             self._newest = 0
         elif isinstance(message, link.Phase):
-            self._watchdog.hear(now_ns, message.name)
+            self._watchdog.note_message(now_ns, message.name)
             if message.name == "waiting" and message.reason:
                 self._board.post("absent", message.reason)
             elif message.name == "resetting":
@@ -227,23 +227,23 @@ class CaptureSupervisor:
             elif message.name == "starting":
                 self._board.post("starting", "the camera is being started")
         else:
-            self._watchdog.hear(now_ns)
+            self._watchdog.note_message(now_ns)
 
     def _accept(self, opened: link.Opened) -> None:
-        """Take a stream as the one that was opened first, or refuse it.
+        """Accept a stream that equals the one opened first, or refuse it.
 
         Raises:
-            SourceError: it is of another camera, or has another lens: all that was made for the first one is void.
+            SourceError: its camera or lens differs: all that was prepared for the first one is void.
         """
         if self.opened is not None and _identity(opened) != _identity(self.opened):
             raise SourceError(
-                f"the camera was {_named(self.opened)} and is {_named(opened)} now; it has to be opened again"
+                f"expected the camera {_named(self.opened)}, got {_named(opened)}: the source must be opened again"
             )
         self.opened = opened
         self._known.set()
 
-    def _look_for_frames(self, now_ns: int) -> None:
-        """See whether a frame has come; what was said of it may have been lost."""
+    def _check_for_frame(self, now_ns: int) -> None:
+        """Check for a new frame; its message may have been lost."""
         frames, opened = self._frames, self.opened
         if frames is None or opened is None or self._watchdog.phase != "streaming":
             return
@@ -254,7 +254,7 @@ class CaptureSupervisor:
             self._board.post(self._flowing, LOOKING if self._flowing == "looking" else "", opened.warning)
             self.news.set()
         elif self._request.lockstep:
-            # It waits for the reader, or our word that it may go on was lost.
+            # It waits for the reader, or the permission to continue was lost.
             if newest > self.last_number:
                 self._watchdog.frame(now_ns)
             else:
@@ -263,15 +263,15 @@ class CaptureSupervisor:
     def _judge(self, now_ns: int) -> None:
         silent_s = self._watchdog.silent_s(now_ns)
         if silent_s is not None and self._watchdog.phase == "streaming":
-            self._board.post("silent", "no frame comes from the camera")
+            self._board.post("silent", "the camera sends no frames")
 
     def _acknowledge(self) -> None:
         if self._request.lockstep and self._session is not None:
-            self._session.tell(link.Taken(self.last_number))
+            self._session.send(link.Taken(self.last_number))
 
 
 def _identity(opened: link.Opened) -> link.Opened:
-    """What must not change while a source is open."""
+    """Return the properties that must not change while a source is open."""
     return replace(opened, firmware="", usb="", warning="", fps=0)
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cameras the RealSense SDK sees, and the one that is wanted. Blocking; for the capture process alone.
+"""Search for the configured camera among the RealSense SDK's devices. Blocking; for the capture process only.
 
-A recording is loaded onto the SDK's context, where it is a device like any other.
+A recording is loaded onto the SDK's context, and is then a device like any other.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from shared.errors import SourceError
 
 GONE_S = 3.0
 RETURN_S = 10.0
-"""After a reset a camera goes within a second or two, and is back some 3 s later."""
+"""After a reset a camera disappears within a second or two, and returns some 3 s later."""
 
 LOOK_EVERY_S = 0.5
-"""For a camera that is not there, since the SDK's own notice of it is sometimes missed."""
+"""Time between two searches for an absent camera, since the SDK sometimes misses a hotplug event."""
 
 
 class RecordingBroken(SourceError):
-    """A recording that cannot be played; to begin anew would not help."""
+    """A recording that cannot be played; a new start would not help."""
 
 
 class Unplugged(SourceError):
-    """The camera was there, and is not any more."""
+    """The camera was connected, and is no longer."""
 
 
 class Devices:
@@ -42,11 +42,11 @@ class Devices:
         self._recording: Any = None
         self._changed = threading.Event()
         self.removed = threading.Event()
-        """Set when the device that was found is unplugged."""
+        """Set when the device in use is unplugged."""
         context.set_devices_changed_callback(self._on_change)
 
     def find(self) -> tuple[Any, str]:
-        """The device, or None and why it is not there, in one sentence.
+        """Return the device, or None and the reason for its absence in one sentence.
 
         Raises:
             RecordingBroken: the recording cannot be opened.
@@ -59,25 +59,25 @@ class Devices:
         try:
             devices = {serial_of(device): device for device in self._context.query_devices()}
         except RuntimeError as error:
-            # A device that goes while the SDK lists it.
+            # A device that is unplugged while the SDK lists it.
             return None, f"the list of cameras cannot be read: {error}"
         device, reason = _chosen(devices, self._request.serial)
         self._device = device
         return device, reason
 
     def wait(self, timeout_s: float = LOOK_EVERY_S) -> None:
-        """Until a device comes or goes, but no longer than `timeout_s`."""
+        """Wait for a device to appear or disappear, at most `timeout_s`."""
         self._changed.wait(timeout_s)
 
     def reset(self, device: Any) -> Any:
-        """Reset the hardware of `device`, and return the device that comes back.
+        """Reset the hardware of `device`, and return the device that reappears.
 
         Raises:
-            SourceError: none did.
+            SourceError: no device reappeared.
         """
         self.removed.clear()
         device.hardware_reset()
-        # Not every kernel tells when it goes; then it must at least be there at the end.
+        # Not every kernel reports the disappearance; then it must at least be present at the end.
         self.removed.wait(GONE_S)
         deadline_ns = monotonic_ns() + round(RETURN_S * NS_PER_S)
         while True:
@@ -91,24 +91,24 @@ class Devices:
 
     def _load(self, path: str) -> Any:
         if not Path(path).is_file():
-            raise RecordingBroken(f"{path}: there is no such recording")
+            raise RecordingBroken(f"{path}: expected a recording, there is no such file")
         try:
             return self._context.load_device(path)
         except RuntimeError as error:
             why = str(error).rsplit(": ", 1)[-1]
             raise RecordingBroken(
-                f"{path}: no recording that can be played; it may have been cut short ({why})"
+                f"{path}: expected a recording that can be played; it may be truncated ({why})"
             ) from error
 
     def _on_change(self, info: rs.event_information) -> None:
-        """On a thread of the SDK: only raises flags."""
+        """Set flags only: this runs on a thread of the SDK."""
         if self._device is not None and info.was_removed(self._device):
             self.removed.set()
         self._changed.set()
 
 
 def survey(context: rs.context) -> list[dict[str, Any]]:
-    """The cameras on a context, each with what a person wants to know of it."""
+    """Return the cameras on a context, each with its description for a person."""
     return [
         {
             "serial": serial_of(device),
@@ -122,29 +122,29 @@ def survey(context: rs.context) -> list[dict[str, Any]]:
 
 
 def serial_of(device: Any) -> str:
-    """A device's serial number; empty where it has none (in recovery mode)."""
+    """Return a device's serial number; empty if it has none (in recovery mode)."""
     return info_of(device, rs.camera_info.serial_number)
 
 
 def info_of(device: Any, what: rs.camera_info) -> str:
-    """What a device tells of itself; empty where it tells nothing."""
+    """Return a device's own information; empty if it has none."""
     return str(device.get_info(what)) if device.supports(what) else ""
 
 
 def profiles_of(device: Any) -> Iterator[tuple[Any, Any]]:
-    """Each sensor of a device with each of its stream profiles."""
+    """Yield each sensor of a device with each of its stream profiles."""
     for sensor in device.query_sensors():
         for profile in sensor.get_stream_profiles():
             yield sensor, profile
 
 
 def _chosen(devices: dict[str, Any], wanted: str) -> tuple[Any, str]:
-    """The wanted device, or the only one; or None, and why."""
+    """Return the configured device, or the only one; or None, and the reason."""
     there = ", ".join(serial or "one without a serial number" for serial in sorted(devices)) or "none"
     if wanted in devices:
         return devices[wanted], ""
     if wanted:
-        return None, f"no RealSense camera {wanted} is connected (there is {there})"
+        return None, f"no RealSense camera {wanted} is connected (connected: {there})"
     if len(devices) > 1:
         return None, f"{len(devices)} RealSense cameras are connected ({there}); choose one by source.serial"
     if not devices:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a frame of the RealSense SDK was taken, by our clock: what the SDK tells of time, handed to `CameraClock`."""
+"""Capture time of an SDK frame by the unit's clock: passes the SDK's times to `CameraClock`."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ COMPARE_EVERY_NS = NS_PER_S
 """Clocks drift by less than 0.1 ms in the time between two readings of the camera's clock."""
 
 EXPOSURE_MAX_US = 100_000
-"""Between the middle of the exposure and the read-out; what is more is no exposure."""
+"""Time between the middle of the exposure and the read-out; a longer exposure value is invalid."""
 
 
 class SdkClock:
-    """Of one stream. `device` is asked for its time now and then, but for None: a recording has no clock that runs."""
+    """The clock of one stream. `device` is read from time to time; None: a recording has no running clock."""
 
     def __init__(self, device: Any | None, latency_ns: int) -> None:
         self._device = device
@@ -27,10 +27,10 @@ class SdkClock:
         self._compared_ns = 0
 
     def captured_at_ns(self, frame: Any, arrived_ns: int) -> int:
-        """Middle of the exposure of a frame that arrived at `arrived_ns`, CLOCK_MONOTONIC."""
+        """Return the middle of the exposure of a frame that arrived at `arrived_ns`, CLOCK_MONOTONIC."""
         domain = frame.get_frame_timestamp_domain()
         if domain not in self._clocks:
-            # It may change while we look: the SDK stamps the arrival wherever the kernel passes no metadata on.
+            # The domain may change at run time: without metadata from the kernel the SDK stamps the arrival.
             wraps = domain == rs.timestamp_domain.hardware_clock
             self._clocks[domain] = CameraClock(self._latency_ns, wraps=wraps)
         clock = self._clocks[domain]
@@ -44,13 +44,13 @@ class SdkClock:
         if domain == rs.timestamp_domain.global_time:
             clock.compare(asked_ns, wall_ns(), monotonic_ns())
         elif domain == rs.timestamp_domain.hardware_clock:
-            # Not every camera can be asked; the fastest frame decides then.
+            # Some cameras have no readable clock; then the fastest frame decides.
             with suppress(RuntimeError):
                 clock.compare(asked_ns, round(device.get_device_time_ms() * NS_PER_MS), monotonic_ns())
 
 
 def _exposure_ns(frame: Any) -> int:
-    """From the middle of the exposure to the stamp, which is of the read-out."""
+    """Return the time from the middle of the exposure to the stamp, which is of the read-out."""
     read_out, middle = rs.frame_metadata_value.frame_timestamp, rs.frame_metadata_value.sensor_timestamp
     if not (frame.supports_frame_metadata(read_out) and frame.supports_frame_metadata(middle)):
         return 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of the pictures that a camera offers comes nearest to the one that was asked for."""
+"""Choice of the offered profile that is closest to the configured one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Profile(NamedTuple):
 
     @property
     def pixels(self) -> int:
-        """How many a picture has."""
+        """Number of pixels of an image."""
         return self.width * self.height
 
     def __str__(self) -> str:
@@ -24,10 +24,10 @@ class Profile(NamedTuple):
 
 
 def choose(wanted: Profile, offered: Iterable[Profile]) -> Profile | None:
-    """`wanted` where it is offered; else the largest picture no larger than it that comes at least as often.
+    """Return `wanted` if it is offered; else the largest image no larger than it that comes at least as often.
 
-    Where nothing comes so often (an old port, many cameras on a hub), the most frequent one, and of these the largest.
-    None when nothing at all is offered. A rate counts for more than pixels: what moves is seen late otherwise.
+    If no profile is as frequent (an old port, many cameras on a hub), it is the most frequent one, and of these the
+    largest. None if nothing is offered. Rate counts for more than pixels: at a low rate, motion is seen late.
     """
     profiles = set(offered)
     if wanted in profiles:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes recordings as the RealSense SDK does, from images that did not come from a camera.
+"""Writes recordings in the format of the RealSense SDK, from images that did not come from a camera.
 
-The SDK's software device plays the camera, and its own recorder writes the file. For a process of its own, since the
-SDK may take a process down at its end.
+The SDK's software device plays the camera, and its own recorder writes the file. Run it in a process of its own, since
+the SDK may crash its process at the end.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from edge_unit.sources.realsense.sdk import rs
 from shared.errors import SourceError
 
 SUFFIX = ".db3"
-"""The only kind of file that today's SDK writes; it still plays the older `.bag`."""
+"""The only file format that today's SDK writes; it still plays the older `.bag`."""
 
 WRITE_MS = 5_000
-"""For one image to pass through the recorder."""
+"""Time for one image to pass through the recorder."""
 
 FORMATS = {
     "depth": (rs.stream.depth, 0, rs.format.z16, 2),
@@ -35,7 +35,7 @@ FORMATS = {
 
 @dataclass(frozen=True)
 class RecordedStream:
-    """One stream of the camera; `stands_at_m` is its origin in the depth camera's frame, turned like it."""
+    """One stream of the camera; `stands_at_m` is its origin in the depth camera's frame, with the same orientation."""
 
     stream: Stream
     width: int
@@ -50,7 +50,7 @@ class RecordedStream:
 
 @dataclass(frozen=True)
 class RecordedCamera:
-    """What the camera tells of itself."""
+    """The identity and the constants of the camera."""
 
     serial: str
     model: str
@@ -61,13 +61,13 @@ class RecordedCamera:
 
 
 class SdkRecorder:
-    """A recording that is being written; complete only when it was closed."""
+    """A recording that is being written; complete only after `close`."""
 
     def __init__(self, path: Path, camera: RecordedCamera, streams: Sequence[RecordedStream]) -> None:
-        """Begin the file `path`, replacing one that is there. The first stream must be depth.
+        """Start the file `path`; an existing one is replaced. The first stream must be depth.
 
         Raises:
-            SourceError: it cannot be written; names it.
+            SourceError: it cannot be written; the text names it.
         """
         if path.suffix != SUFFIX:
             raise SourceError(f"{path}: expected a name that ends in {SUFFIX}, the only kind that the SDK writes")
@@ -82,7 +82,7 @@ class SdkRecorder:
             if text:
                 device.register_info(what, text)
         self._sensor = device.add_sensor("Stereo Module")
-        # Without this option the scale is lost in the file, whatever the frames say.
+        # Without this option the scale is missing in the file, even though the frames have it.
         self._sensor.add_read_only_option(rs.option.depth_units, camera.depth_scale_m)
         self._sensor.add_read_only_option(rs.option.stereo_baseline, 1000.0 * camera.stereo_baseline_m)
         self._depth_scale_m = camera.depth_scale_m
@@ -104,7 +104,7 @@ class SdkRecorder:
         """Append an image: uint16 for depth, uint8 (H, W) for infrared, uint8 (H, W, 3) RGB for colour.
 
         Raises:
-            SourceError: the recorder did not take it.
+            SourceError: the recorder did not accept it.
         """
         frame = rs.software_video_frame()
         frame.pixels = np.ascontiguousarray(pixels)
@@ -125,7 +125,7 @@ class SdkRecorder:
         """Complete the file."""
         self._recorded.stop()
         self._recorded.close()
-        # The file is complete when the SDK's last reference to it is gone, not before.
+        # The file is complete only after the SDK's last reference to it is gone.
         self._recorded = self._recorder = self._device = None
         gc.collect()
 
@@ -143,7 +143,7 @@ class SdkRecorder:
 
 
 def _away(stands_at_m: tuple[float, float, float]) -> rs.extrinsics:
-    """Maps points of the depth camera's frame into that of a stream that stands there."""
+    """Return the map from the depth camera's frame to the frame of a stream at that position."""
     to_stream = rs.extrinsics()
     to_stream.rotation = np.eye(3).ravel().tolist()
     to_stream.translation = [-value for value in stands_at_m]

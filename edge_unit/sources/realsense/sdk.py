@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The RealSense SDK, for the capture process alone: the one place that imports `pyrealsense2`, after its libusb.
+"""The RealSense SDK, for the capture process only: no other module imports `pyrealsense2`; libusb is loaded before it.
 
-Its wheel carries all that it needs but libusb. The system's is taken where there is one, since it hears of a camera
-from udev, which by then has given it its rights; that of the package `libusb-package` hears of it from the kernel.
+Its wheel contains all its needs except libusb. The system's libusb is preferred: it learns of a camera from udev, after
+udev has set the camera's permissions. The libusb of the package `libusb-package` learns of it from the kernel.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ import importlib.util
 from pathlib import Path
 
 SYSTEM = "libusb-1.0.so.0"
-"""The name by which the SDK asks for it; whichever library of this name was loaded before is what it gets."""
+"""The library name that the SDK requests; it gets the library that was loaded under this name before."""
 
 PACKAGE, CARRIED = "libusb_package", "libusb-1.0.so"
 
 
 def load_libusb() -> str:
-    """Load libusb, and tell whose it is: the system's, or that of `libusb-package`.
+    """Load libusb, and return its origin: the system, or the package `libusb-package`.
 
     Raises:
-        ImportError: there is neither.
+        ImportError: neither has it.
     """
     try:
         ctypes.CDLL(SYSTEM, mode=ctypes.RTLD_GLOBAL)
         return "the system"
     except OSError as error:
         reason = str(error)
-    # Found, not imported: it brings modules along that nobody here needs.
+    # Found, not imported: the import would load modules that are not needed.
     spec = importlib.util.find_spec(PACKAGE)
     for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
         try:
@@ -41,6 +41,6 @@ def load_libusb() -> str:
 
 LIBUSB_OF = load_libusb()
 
-import pyrealsense2 as rs  # noqa: E402  its library has to be there before
+import pyrealsense2 as rs  # noqa: E402  its library must be loaded before
 
 __all__ = ["LIBUSB_OF", "rs"]

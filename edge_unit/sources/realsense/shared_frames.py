@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of one process in the hands of another, without a copy: a few slots in memory that both see.
+"""Frames passed between two processes without a copy: a few slots in shared memory.
 
-The memory has no name: it is a file that lies nowhere, and goes when the last process that has it open is gone,
-however that process went. One writer, one reader. The writer never touches the slot that the reader holds nor the
-newest one, and never waits; the reader takes the newest, so a slow one skips frames and never lags.
+The memory has no name: it is an anonymous file that vanishes when the last process that has it open ends, in whatever
+way. One writer, one reader. The writer never touches the reader's slot nor the newest one, and never waits. The reader
+takes the newest, so a slow one skips frames and never lags.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SLOTS = 4
-"""One held by the reader, one newest, one being written, and one more, so that the two seldom meet."""
+"""One held by the reader, one newest, one being written, and a spare one, so that the two seldom meet."""
 
 PAGE_BYTES = mmap.PAGESIZE
 
@@ -33,10 +33,10 @@ WORDS = 8
 
 @dataclass(frozen=True)
 class SharedFrame:
-    """A frame as it lies in shared memory, valid until the reader takes another one.
+    """A frame in shared memory, valid until the reader takes another one.
 
-    `pixels` are (H, W) uint16, (H, W) uint8 or (H, W, 3) uint8. `number` rises over everything that was ever
-    delivered; `camera_number` is the camera's own count, `position_ns` the place in a recording.
+    `pixels` are (H, W) uint16, (H, W) uint8 or (H, W, 3) uint8. `number` rises over all frames ever delivered;
+    `camera_number` is the camera's own count, `position_ns` the position in a recording.
     """
 
     pixels: NDArray[Any]
@@ -49,10 +49,10 @@ class SharedFrame:
 
 
 class SharedFrames:
-    """The memory, from either side."""
+    """The shared memory, for either side."""
 
     def __init__(self, descriptor: int, shape: tuple[int, ...], dtype: type[np.uint16] | type[np.uint8]) -> None:
-        """Map the memory behind `descriptor`, which stays the caller's to close."""
+        """Map the memory behind `descriptor`; the caller closes the descriptor."""
         image_bytes = _pages(int(np.prod(shape)) * np.dtype(dtype).itemsize)
         memory = mmap.mmap(descriptor, PAGE_BYTES + SLOTS * image_bytes)
         self._head = np.frombuffer(memory, np.int64, FIRST_SLOT + SLOTS * WORDS)
@@ -64,7 +64,7 @@ class SharedFrames:
 
     @staticmethod
     def create(shape: tuple[int, ...], dtype: type[np.uint16] | type[np.uint8]) -> int:
-        """New memory for images of this kind; returns its descriptor."""
+        """Allocate memory for images of this kind; returns its descriptor."""
         descriptor = os.memfd_create("cellwatch-frames", os.MFD_CLOEXEC)
         size = PAGE_BYTES + SLOTS * _pages(int(np.prod(shape)) * np.dtype(dtype).itemsize)
         os.ftruncate(descriptor, size)
@@ -76,7 +76,7 @@ class SharedFrames:
     def write(
         self, pixels: NDArray[Any], number: int, camera_number: int, captured_at_ns: int, position_ns: int = 0
     ) -> None:
-        """Make this the newest frame: the one copy on its way."""
+        """Store this as the newest frame: the only copy on its way."""
         slot, head = self._free_slot(), self._head
         words = _words(slot)
         np.copyto(self._images[slot], pixels)
@@ -89,7 +89,7 @@ class SharedFrames:
         head[LATEST] = slot
 
     def _free_slot(self) -> int:
-        """A slot that is neither newest nor held, marked as being written (its sequence is odd)."""
+        """Return a slot that is neither newest nor held, marked as being written (its sequence is odd)."""
         head = self._head
         latest = int(head[LATEST])
         for step in range(1, 2 * SLOTS):
@@ -101,7 +101,7 @@ class SharedFrames:
             self._order()
             if int(head[HELD]) != slot:
                 return slot
-            # The reader was about to hold it just now; it sees the odd sequence, or we see its hold, never neither.
+            # The reader was about to hold this slot: it sees the odd sequence, or the writer sees its hold, or both.
             head[sequence] += 1
         raise AssertionError("a reader holds one slot, so there is always a free one")
 
@@ -109,12 +109,12 @@ class SharedFrames:
 
     @property
     def newest_number(self) -> int:
-        """The number of the newest frame; 0 when there is none yet."""
+        """The number of the newest frame; 0 if there is none yet."""
         slot = int(self._head[LATEST])
         return 0 if slot == NO_SLOT else int(self._head[_words(slot) + NUMBER])
 
     def take(self, after: int) -> SharedFrame | None:
-        """Hold the newest frame, if its number is greater than `after`; the one held before is given up then."""
+        """Hold the newest frame, if its number is greater than `after`; this releases the one held before."""
         head = self._head
         while True:
             slot = int(head[LATEST])
@@ -141,11 +141,11 @@ class SharedFrames:
             )
 
     def intact(self, frame: SharedFrame) -> bool:
-        """Whether nobody wrote into a frame since it was taken."""
+        """Return True if a frame was not overwritten since it was taken."""
         return int(self._head[_words(frame.slot) + SEQUENCE]) == frame.sequence
 
     def _order(self) -> None:
-        """What was stored before is seen by the other process before anything is read after."""
+        """Memory barrier: the other process sees all earlier stores before any later load here."""
         with self._fence:
             pass
 

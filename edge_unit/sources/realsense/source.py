@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A RealSense camera, or a recording of one, as a source of frames.
 
-Capture runs in a process of its own, frames come through shared memory without a copy in between; a camera that is
-unplugged, stalls or takes its process along is waited for and begun anew, while `status` tells of it at once.
+A separate process captures, and frames come through shared memory without a copy. If a camera is unplugged, stalls or
+crashes the process, the source waits and restarts the capture, and `status` reports it at once.
 """
 
 from __future__ import annotations
@@ -33,34 +33,34 @@ from shared.errors import InputError, SourceError
 from shared.text_files import parse_numbers, read_text
 
 SIZES = ((424, 240), (480, 270), (640, 480), (848, 480), (1280, 720))
-"""Depth pictures that every camera of the D400 family offers; 848x480 is what its stereo was made for."""
+"""Depth image sizes that every camera of the D400 family offers; 848x480 is the native size of its stereo."""
 
 
 class RealsenseSourceConfig(BaseModel):
-    """Which camera and which picture of it, or which recording."""
+    """The camera and its image size, or the recording."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     kind: Literal["realsense"] = "realsense"
     serial: Text | None = Field(
-        default=None, min_length=1, max_length=64, description="Of the camera; not needed where there is only one."
+        default=None, min_length=1, max_length=64, description="Of the camera; not needed if only one is connected."
     )
     width: int = Field(default=848, description="Columns: 424, 480, 640, 848 or 1280.")
     height: int = Field(default=480, description="Rows: 240, 270, 480, 480 or 720.")
     fps: Literal[6, 15, 30, 60, 90] = 15
     recording: ExpandedPath | None = Field(default=None, description="A .db3 or .bag instead of a camera.")
-    real_time: bool = Field(default=True, description="Of a recording: at its own pace; else each frame, when taken.")
-    loop: bool = Field(default=False, description="Of a recording: begin again at its end.")
+    real_time: bool = Field(default=True, description="Of a recording: at its own rate; else as fast as the reader.")
+    loop: bool = Field(default=False, description="Of a recording: start again at its end.")
     joints_file: ExpandedPath | None = Field(
         default=None, description="Of a recording: rows of joint positions; row i belongs to frame number i + 1."
     )
     fx_stereo: float | None = Field(
-        default=None, gt=0.0, description="Focal length in pixels at which the imagers match, where it is not fx."
+        default=None, gt=0.0, description="Focal length in pixels at which the imagers match, if it is not fx."
     )
     arrival_latency_ms: float = Field(
-        default=25.0, ge=0.0, le=300.0, description="From exposure to arrival, where the camera's clock is not told."
+        default=25.0, ge=0.0, le=300.0, description="From exposure to arrival, without a camera clock."
     )
-    open_timeout_s: float = Field(default=20.0, gt=0.0, le=600.0, description="For a camera to deliver.")
+    open_timeout_s: float = Field(default=20.0, gt=0.0, le=600.0, description="For the camera's first frame.")
 
     @model_validator(mode="after")
     def _consistent(self) -> RealsenseSourceConfig:
@@ -70,13 +70,13 @@ class RealsenseSourceConfig(BaseModel):
         if self.recording is None:
             only = {"real_time": not self.real_time, "loop": self.loop, "joints_file": self.joints_file is not None}
             if wrong := next((name for name, given in only.items() if given), None):
-                raise ValueError(f"{wrong} is for a recording, and there is none")
+                raise ValueError(f"{wrong} is for a recording, and none is set")
         elif self.serial is not None:
             raise ValueError("expected serial (of a camera) or recording, got both")
         return self
 
     def request(self, stream: link.Stream = "depth") -> link.Request:
-        """What the capture process is asked for."""
+        """Return the request for the capture process."""
         return link.Request(
             stream=stream,
             serial=self.serial or "",
@@ -90,15 +90,15 @@ class RealsenseSourceConfig(BaseModel):
         )
 
 
-class Look:
-    """Pictures of one image stream, while depth pauses."""
+class RealsenseImages:
+    """Images of one stream, while depth is paused."""
 
     def __init__(self, info: ImageInfo, supervisor: CaptureSupervisor) -> None:
         self.info = info
         self._supervisor = supervisor
 
     async def images(self) -> AsyncGenerator[ImageFrame, None]:
-        """Pictures as they come, latest wins; ends where a recording ends.
+        """Yield images as they come, latest-only; ends with a recording.
 
         Raises:
             SourceError: the camera will deliver no more.
@@ -108,7 +108,7 @@ class Look:
 
 
 class RealsenseSource:
-    """A `DepthSource` that `ReportsStatus`, and can `look` at the calibration board."""
+    """A `DepthSource` that `ReportsStatus`, and an `ImageSource` for the calibration board."""
 
     def __init__(self, config: RealsenseSourceConfig, command: Sequence[str] = CAPTURE_COMMAND) -> None:
         self._config = config
@@ -137,75 +137,75 @@ class RealsenseSource:
             raise
 
     async def frames(self) -> AsyncGenerator[DepthFrame, None]:
-        """Frames as they come, latest wins; `depth` lies in shared memory and is valid until the next frame is taken.
+        """Yield frames as they come, latest-only; `depth` lies in shared memory, valid until the next frame is taken.
 
-        While the camera is away this waits. It ends where a recording ends.
+        This waits while the camera is away, and ends with a recording.
 
         Raises:
-            SourceError: it is not open, it is another camera now, or a recording is damaged.
+            SourceError: the source is not open, the camera is another one now, or a recording is damaged.
         """
         if self._supervisor is None:
-            raise SourceError("the camera: frames were asked for before it was opened")
+            raise SourceError("the camera: expected an open source before frames are read: call open first")
         async for frame in self._supervisor.frames():
             depth = cast("NDArray[np.uint16]", frame.pixels)
             yield DepthFrame(depth, frame.captured_at_ns, frame.number, self._joints_of(frame))
 
     async def close(self) -> None:
-        """End the capture process; harmless when there is none."""
+        """End the capture process; no effect if there is none."""
         supervisor, self._supervisor = self._supervisor, None
         if supervisor is not None:
             await supervisor.close()
         self._board.post("closed")
 
-    # ------------------------------------------------------------------ how it is doing
+    # ------------------------------------------------------------------ its status
 
     @property
     def status(self) -> SourceStatus:
-        """How it is doing now."""
+        """The current status."""
         return self._board.now
 
     async def next_status(self, known: SourceStatus) -> SourceStatus:
-        """Wait until the status is another than `known`, and return it."""
+        """Wait until the status differs from `known`, and return it."""
         return await self._board.next(known)
 
     @property
     def opened(self) -> link.Opened | None:
-        """All that the camera told when it was opened."""
+        """All properties that the camera reported when it was opened."""
         return None if self._supervisor is None else self._supervisor.opened
 
     @property
     def pid(self) -> int | None:
-        """The id of the capture process, while there is one."""
+        """The id of the capture process, if there is one."""
         return None if self._supervisor is None else self._supervisor.pid
 
     # ------------------------------------------------------------------ the calibration board
 
     @asynccontextmanager
-    async def look(self, stream: ImageStream) -> AsyncIterator[Look]:
-        """Pictures of another stream, the emitter off; depth pauses meanwhile, and goes on afterwards by itself.
+    async def open_images(self, stream: ImageStream) -> AsyncIterator[RealsenseImages]:
+        """Deliver images of another stream, with the emitter off; depth is paused, and resumes afterwards.
 
         Raises:
-            SourceError: it is not open, or the stream does not start; depth goes on then, too.
+            SourceError: the source is not open, or the stream does not start; depth then resumes, too.
         """
         depth = self._supervisor
         if depth is None:
-            raise SourceError("the camera: a look was asked for before it was opened")
+            raise SourceError("the camera: expected an open source before images are read: call open first")
         await depth.pause()
         images = CaptureSupervisor(self._config.request(stream), self._board, "looking", self._command)
         images.begin()
         try:
             opened = await images.first_opened(self._config.open_timeout_s)
-            yield Look(image_info(opened), images)
+            yield RealsenseImages(image_info(opened), images)
         finally:
             await images.close()
             if self._supervisor is depth:
                 depth.begin()
 
     def _joints_of(self, frame: SharedFrame) -> NDArray[np.float64] | None:
-        """The row of a frame.
+        """Return the joints of a frame.
 
         Raises:
-            SourceError: there is none.
+            SourceError: there is no row for it.
         """
         if self._joints is None:
             return None
@@ -220,10 +220,10 @@ class RealsenseSource:
 
 
 def camera_info(opened: link.Opened, fx_stereo: float | None = None) -> CameraInfo:
-    """A depth camera as its source tells of it.
+    """Return a depth camera's information.
 
     Raises:
-        SourceError: its picture is distorted, or no picture of a depth camera at all.
+        SourceError: its image is distorted, or is not of a depth camera.
     """
     intrinsics = _intrinsics(opened, fx_stereo)
     moved_px = distortion_px(intrinsics, np.array(opened.distortion))
@@ -236,10 +236,10 @@ def camera_info(opened: link.Opened, fx_stereo: float | None = None) -> CameraIn
 
 
 def image_info(opened: link.Opened) -> ImageInfo:
-    """An image stream of a camera, and where it lies to its depth.
+    """Return an image stream's lens and its pose relative to depth.
 
     Raises:
-        SourceError: it is no picture of a camera.
+        SourceError: it is not an image of a camera.
     """
     if opened.stream == "depth":
         raise SourceError(f"camera {opened.serial}: expected an image stream, got depth")
@@ -261,7 +261,7 @@ def _intrinsics(opened: link.Opened, fx_stereo: float | None) -> Intrinsics:
             fy=opened.fy,
             cx=opened.cx,
             cy=opened.cy,
-            # The SDK keeps it as float32; 0.001 m is meant.
+            # The SDK keeps it as float32; the true value is 0.001 m.
             depth_scale_m=float(str(np.float32(opened.depth_scale_m))),
             stereo_baseline_m=opened.stereo_baseline_m or D435_BASELINE_M,
             fx_stereo=fx_stereo,
@@ -271,7 +271,7 @@ def _intrinsics(opened: link.Opened, fx_stereo: float | None) -> Intrinsics:
 
 
 def _read_joints(path: Path) -> NDArray[np.float64]:
-    """Joint positions (frames, n)."""
+    """Read joint positions (frames, n)."""
     try:
         return parse_numbers(read_text(path))
     except (OSError, ValueError) as error:

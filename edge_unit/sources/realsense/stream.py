@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One stream of one device of the RealSense SDK. Blocking; for the capture process alone.
+"""One stream of one device of the RealSense SDK. Blocking; for the capture process only.
 
-The device's sensor is used, not the SDK's pipeline: that one loses a frame now and then at the start of a recording,
-and halts for 10 s when it is told where to begin. What else the SDK does that its manual does not tell is written
-where it is dealt with.
+It uses the device's sensor, not the SDK's pipeline. The pipeline sometimes loses a frame at the start of a recording,
+and halts for 10 s after a seek. Other behaviour of the SDK that its manual does not mention is described next to the
+code that handles it.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from shared.clock import NS_PER_S, NS_PER_US, monotonic_ns
 from shared.errors import SourceEnded, SourceError
 
 COLOR_SIZE = (1280, 720)
-"""For the board the picture is wanted large, whatever the depth stream's size."""
+"""Image size for the board: large, for any size of the depth stream."""
 
 READ_AHEAD_NS = 2 * NS_PER_S
-"""Of a recording: more than the SDK's queues hold."""
+"""Frames of a recording: more than the SDK's queues hold."""
 
 BASELINE_RANGE_M = (0.005, 1.0)
-"""Of what the option `stereo_baseline` tells, in mm; some firmware tells 0."""
+"""Limits of the option `stereo_baseline`, in mm; some firmware reports 0."""
 
 
 class Reading(NamedTuple):
-    """One image, still in the SDK's hands: `pixels` is valid until the next is read.
+    """One image, still owned by the SDK: `pixels` is valid until the next is read.
 
-    `position_ns` is how far a recording was read when it came, which may be some frames further.
+    `position_ns` is the read position of a recording at its arrival, which may be some frames further.
     """
 
     pixels: NDArray[Any]
@@ -49,7 +49,7 @@ class Reading(NamedTuple):
 
 @dataclass(frozen=True)
 class _Kind:
-    """A stream in the SDK's words; a negative index means any."""
+    """A stream in the SDK's terms; a negative index means any."""
 
     stream: rs.stream
     index: int
@@ -88,11 +88,11 @@ class SdkStream:
     # ------------------------------------------------------------------ starting and stopping
 
     def start(self) -> Opened:
-        """Start; a recording goes on where the request wants it to.
+        """Start; a recording resumes at the request's position.
 
         Raises:
             RecordingBroken: the recording has no such stream.
-            SourceError: the camera is in use, or does not offer it.
+            SourceError: the camera is in use, or does not offer the stream.
         """
         try:
             self._sensor, self._profile = self._choose()
@@ -113,18 +113,18 @@ class SdkStream:
         return opened
 
     def rewind(self) -> None:
-        """Begin an ended recording again."""
+        """Play an ended recording again."""
         self._sensor.stop()
         self._sensor.close()
         self._last_number = self._position_ns = 0
         with self._condition:
             self._waiting, self._ended = None, False
-        # Only an opened sensor begins at the first frame again.
+        # Only a newly opened sensor starts at the first frame again.
         self._sensor.open(self._profile)
         self._sensor.start(self._on_frame)
 
     def stop(self) -> None:
-        """Stop, and leave the emitter on for whoever is next."""
+        """Stop, and leave the emitter on for the next user."""
         with self._condition:
             self._stopping = True
             self._condition.notify_all()
@@ -135,7 +135,7 @@ class SdkStream:
             _set(self._device, rs.option.emitter_enabled, 1.0)
 
     def _choose(self) -> tuple[Any, Any]:
-        """The sensor and the profile to run: as asked for, or what comes nearest to it."""
+        """Return the sensor and the profile to run: the requested one, or the closest to it."""
         request = self._request
         offered = {_profile(found): (sensor, found) for sensor, found in profiles_of(self._device) if self._is(found)}
         size = COLOR_SIZE if request.stream == "color" else (request.width, request.height)
@@ -148,7 +148,7 @@ class SdkStream:
         raise SourceError(f"camera {self._serial} offers {what}")
 
     def _is(self, profile: Any) -> bool:
-        """Whether this is a profile of the asked stream."""
+        """Return True if this is a profile of the requested stream."""
         kind = self._kind
         return (
             profile.stream_type() == kind.stream
@@ -157,21 +157,21 @@ class SdkStream:
         )
 
     def _set_options(self) -> None:
-        """Emitter on for depth, off for pictures of the board; time stamps by the camera's own clock."""
+        """Switch the emitter on for depth, off for images of the board; use time stamps of the camera's own clock."""
         _set(self._device, rs.option.emitter_enabled, 1.0 if self._request.stream == "depth" else 0.0)
-        # Else the SDK maps them to the wall clock, which may be set at any time (and it errs when the counter wraps).
+        # Else the SDK maps them to the wall clock, which may be set at any time (with errors when the counter wraps).
         _set(self._device, rs.option.global_time_enabled, 0.0)
 
     def _prepare(self, playback: Any) -> None:
-        """Have the recording played from where it was left, at its own pace or at ours."""
+        """Play the recording from the request's position, at its own rate or at the reader's."""
         playback.set_status_changed_callback(self._on_status)
         playback.set_real_time(not self._request.lockstep)
         if self._last_number:
-            # The SDK reads ahead of what it delivers; where no frame may be missing, go back further than that.
+            # The SDK reads ahead of its deliveries; if no frame may be missing, seek back further than that.
             margin_ns = READ_AHEAD_NS if self._request.lockstep else 0
             playback.seek(timedelta(microseconds=max(self._request.resume_at_ns - margin_ns, 0) // NS_PER_US))
 
-    # ------------------------------------------------------------------ what it is
+    # ------------------------------------------------------------------ its properties
 
     def _describe(self) -> Opened:
         device, chosen = self._device, _profile(self._profile)
@@ -211,7 +211,7 @@ class SdkStream:
         )
 
     def _warning(self, chosen: Profile) -> str:
-        """What is worse than it need be, and what to do about it."""
+        """Return the defects of the stream with their remedies."""
         request, parts = self._request, []
         usb = info_of(self._device, rs.camera_info.usb_type_descriptor)
         if usb.startswith(("1", "2")):
@@ -224,10 +224,10 @@ class SdkStream:
     # ------------------------------------------------------------------ reading
 
     def read(self, timeout_s: float) -> Reading | None:
-        """The next image, or None when none came in time. What was seen already is passed over.
+        """Return the next image, or None if none came in time. Images seen before are skipped.
 
         Raises:
-            SourceEnded: the recording has come to its end.
+            SourceEnded: the recording has ended.
         """
         with self._condition:
             if self._waiting is None and not self._ended:
@@ -244,21 +244,21 @@ class SdkStream:
         self._reading = frame
         self._last_number = frame.get_frame_number()
         if self._playback is not None:
-            # It jumps back to 0 when the last frame was read, which may be before that frame is delivered.
+            # It jumps back to 0 after reading the last frame, perhaps before that frame is delivered.
             self._position_ns = max(self._position_ns, self._playback.get_position())
-        # Where a recording is not played at its own pace, its stamps tell nothing; the delivery counts.
+        # If a recording does not play at its own rate, its stamps are useless; the time of delivery counts.
         captured_at_ns = arrived_ns if self._request.lockstep else self._clock.captured_at_ns(frame, arrived_ns)
         return Reading(np.asanyarray(frame.get_data()), self._last_number, captured_at_ns, self._position_ns)
 
     @property
     def left_out_s(self) -> float:
-        """How much of a recording was not played although it has ended."""
+        """Return the length of a recording that was not played although it ended."""
         if self._playback is None:
             return 0.0
         return float(self._playback.get_duration().total_seconds() - self._position_ns / NS_PER_S)
 
     def _on_frame(self, frame: Any) -> None:
-        """On a thread of the SDK: leave the frame for `read`; in lockstep not before the last one was read."""
+        """Run on a thread of the SDK: store the frame for `read`; in lockstep wait until the last one was read."""
         arrived_ns = monotonic_ns()
         with self._condition:
             while self._request.lockstep and self._waiting is not None and not self._stopping:
@@ -267,7 +267,7 @@ class SdkStream:
             self._condition.notify_all()
 
     def _on_status(self, status: rs.playback_status) -> None:
-        """On a thread of the SDK. Only this tells the end of a recording at once."""
+        """Run on a thread of the SDK. Only this callback signals the end of a recording at once."""
         if status == rs.playback_status.stopped:
             with self._condition:
                 self._ended = True
@@ -280,7 +280,7 @@ def _profile(found: Any) -> Profile:
 
 
 def _set(device: Any, option: rs.option, value: float) -> None:
-    """Set an option wherever it can be set; a camera without it has nothing to be set."""
+    """Set an option on each sensor that has it; a camera without it is left alone."""
     for sensor in device.query_sensors():
         if sensor.supports(option) and not sensor.is_option_read_only(option):
             sensor.set_option(option, value)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.reporting.page import MARKS_OPEN_MAX, ROWS_OPEN_MAX, marks_in, write_page
+from benchmarks.reporting.page import BASELINE, MARKS_OPEN_MAX, REPORT, ROWS_OPEN_MAX, marks_in, write_page
 from benchmarks.reporting.parts import PARTS
 from benchmarks.reporting.report import Curves, Mark, Result, write
 
@@ -40,14 +40,14 @@ def test_all_marks_are_found_however_deep_they_lie(results: Path) -> None:
     ]
 
 
-def test_a_missed_mark_stands_on_top_with_its_reason(results: Path) -> None:
+def test_a_missed_mark_comes_first_with_its_reason(results: Path) -> None:
     overview, _, _ = page(results).partition("# Results in full")
     assert "| times faster | 29 | ≥ 30 | **missed** |" in overview
     assert "- times faster: backs of links are drawn" in overview
     assert "| real frames: leak, % | 0.01 | ≤ 0.3 | met |" in overview
 
 
-def test_what_was_not_measured_is_told(results: Path) -> None:
+def test_missing_measurements_are_reported(results: Path) -> None:
     text = page(results)
     absent = [part for part in PARTS if part.name not in ("pipeline", "real")]
     assert absent
@@ -55,7 +55,7 @@ def test_what_was_not_measured_is_told(results: Path) -> None:
         assert f"Not measured yet: `make {part.target}`." in text
 
 
-def test_a_result_of_today_stands_before_the_baseline(results: Path, tmp_path: Path) -> None:
+def test_a_result_of_today_precedes_the_baseline(results: Path, tmp_path: Path) -> None:
     write("real", {"marks": [MET.document() | {"value": 0.2}]}, tmp_path / "today")
     marks = write_page((tmp_path / "today", results), tmp_path / "REPORT.md")
     assert [(mark["part"], mark["value"]) for mark in marks] == [("pipeline", MISSED.value), ("real", 0.2)]
@@ -89,3 +89,8 @@ def test_curves_become_a_picture_that_stays_the_same(results: Path) -> None:
 
 def test_a_result_without_marks_has_none() -> None:
     assert list(marks_in({"rows": [1, {"marks": []}], "marks": ["not one"]})) == []
+
+
+def test_the_checked_in_page_is_the_one_of_the_baseline(tmp_path: Path) -> None:
+    write_page((BASELINE,), tmp_path / "REPORT.md")
+    assert REPORT.read_text() == (tmp_path / "REPORT.md").read_text()

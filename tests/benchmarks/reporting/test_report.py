@@ -18,7 +18,7 @@ def test_marks_have_bounds_on_either_side() -> None:
 
 
 @pytest.mark.parametrize("bound", [{"at_most": 1.0}, {"at_least": 0.0}])
-def test_what_was_not_measured_meets_no_mark(bound: dict[str, float]) -> None:
+def test_a_missing_measurement_meets_no_mark(bound: dict[str, float]) -> None:
     mark = Mark("share", math.nan, **bound)
     assert not mark.met
     assert mark.document() == {"name": "share", "value": None, **bound, "met": False}
@@ -46,11 +46,11 @@ def test_a_result_is_valid_json(tmp_path: Path) -> None:
     assert "met     a: 1 (at most 2)" in str(result)
 
 
-def test_a_reason_is_told_only_where_a_mark_is_missed() -> None:
+def test_only_a_missed_mark_has_a_reason() -> None:
     assert Mark("times", 29.0, at_least=30.0, why="backs are drawn").document()["why"] == "backs are drawn"
     assert "why" not in Mark("times", 31.0, at_least=30.0, why="backs are drawn").document()
 
 
-def test_what_was_not_measured_has_no_point() -> None:
+def test_a_missing_measurement_has_no_point() -> None:
     curves = Curves("Recall", "distance, m", "%", {"ours": [(0.5, 99.0), (4.0, math.nan)]})
     assert curves.document()["series"] == {"ours": [[0.5, 99.0]]}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The printed board, read back from the PDF's own numbers and held against the board that cameras look for."""
+"""The printed board, read back from the PDF's own numbers and compared with the board that cameras detect."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def cell_file(folder: Path, board: Board) -> Path:
     names = ("kind", "columns", "rows", "square_m", "marker_m", "dictionary", "first_marker")
     lines = "".join(f"  {name}: {getattr(board, name)}\n" for name in names)
     path = folder / "cell.yaml"
-    # The mesh lies nowhere: printing the board does not need it.
+    # The file of the mesh does not exist: printing the board does not need it.
     path.write_text(
         "name: printed\nbox: {min: [0, 0, 0], max: [1, 1, 1]}\n"
         f"static: [{{name: gone, mesh: gone.stl}}]\nboard:\n{lines}"
@@ -70,7 +70,7 @@ def printed(pdf: Path) -> tuple[NDArray[np.float64], tuple[float, float], str]:
 
 
 @pytest.mark.parametrize("board", [layout(), layout("charuco", 0.047, 0.0351, 4)], ids=["grid", "charuco"])
-def test_what_is_printed_is_what_cameras_look_for(board: BoardLayout, tmp_path: Path) -> None:
+def test_a_printed_board_is_detected(board: BoardLayout, tmp_path: Path) -> None:
     pdf = tmp_path / "board.pdf"
     assert main(["board", "--cell", str(cell_file(tmp_path, board.board)), "--out", str(pdf), "--page", "A3"]) == 0
     black_mm, (width_mm, height_mm), text = printed(pdf)
@@ -78,7 +78,7 @@ def test_what_is_printed_is_what_cameras_look_for(board: BoardLayout, tmp_path: 
     assert sorted((width_mm, height_mm)) == pytest.approx([297.0, 420.0], abs=0.01)
     assert "100 mm: measure me" in text
     assert "DICT_4X4_100" in text
-    # By what OpenCV itself says: each marker's black border is a frame of the printed rectangles.
+    # OpenCV's own statement: each marker's black border is a frame of the printed rectangles.
     for corners_m in np.array(board.aruco.getObjPoints()):
         x0, y0 = 1e3 * corners_m[0, :2] + (page.left_mm, page.top_mm)
         x1, y1 = 1e3 * corners_m[2, :2] + (page.left_mm, page.top_mm)

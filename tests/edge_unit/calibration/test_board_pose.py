@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera's pose by simulated pictures of a board: as it should be seen, and as it should not."""
+"""The camera's pose from simulated images of a board, in good and in poor views."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def off_mm_deg(result: Localisation, T_camera_board: Transform, board: Board = G
 
 
 @pytest.mark.parametrize("board", [GRID, CHARUCO], ids=["grid", "charuco"])
-def test_the_pose_is_found_and_so_is_how_well(board: Board) -> None:
+def test_the_pose_is_found_with_its_uncertainty(board: Board) -> None:
     T_camera_board = before(TILTED, 1.0, board)
     result = found(pictures(T_camera_board, board), board)
     error_mm, error_deg = off_mm_deg(result, T_camera_board, board)
@@ -86,7 +86,7 @@ def test_blur_does_not_move_corners(blur_px: float) -> None:
     assert np.abs(refined - true).max() < 0.05
 
 
-def test_the_stream_may_stand_beside_the_depth_camera_and_distort() -> None:
+def test_the_stream_may_be_beside_the_depth_camera_and_distorted() -> None:
     T_camera_board = before(TILTED, 0.8)
     T_depth_image = from_xyz_rpy((0.015, 0.001, -0.002), (0.01, -0.02, 0.005))
     images = pictures(T_camera_board)
@@ -145,11 +145,11 @@ REFUSED: dict[str, tuple[Callable[[], list[NDArray[np.uint8]]], str]] = {
     ),
     "moved": (
         lambda: [image for z in (0.8, 0.9, 1.0, 1.1) for image in pictures(before(TILTED, z), count=3)],
-        "agree on a pose|from picture to picture",
+        "agree on a pose|from image to image",
     ),
     "few frames": (
         lambda: pictures(before(TILTED, 0.8), count=MIN_FRAMES - 1),
-        f"in 4 of 4 pictures.* in {MIN_FRAMES} pictures",
+        f"in 4 of 4 images.* in {MIN_FRAMES} images",
     ),
 }
 
@@ -161,7 +161,7 @@ def test_a_poor_view_is_refused_with_its_reason(case: str) -> None:
         found(images())
 
 
-def test_what_the_last_picture_shows() -> None:
+def test_the_last_image_is_described() -> None:
     localiser = BoardLocaliser(GRID, CAMERA)
     assert localiser.now == "0 of 12 markers"
     assert localiser.add(pictures(before(TILTED, 0.8), count=1)[0]).T_board_image is not None

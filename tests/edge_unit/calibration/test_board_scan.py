@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looking for the board: by the simulated camera, and through a source that shows what we want."""
+"""The scan for the board: by the simulated camera, and through a source with given images."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ EMPTY = np.full(CAMERA.shape, 90, np.uint8)
 
 
 class Pictures:
-    """A source that shows these pictures, over and over."""
+    """A source that delivers these images, over and over."""
 
     def __init__(self, *pictures: NDArray[np.uint8]) -> None:
         self.info = ImageInfo("infrared", CAMERA, (0.0,) * 5, "brown_conrady", identity())
@@ -40,7 +40,7 @@ class Pictures:
         self.looking = False
 
     @asynccontextmanager
-    async def look(self, stream: ImageStream) -> AsyncIterator[Pictures]:
+    async def open_images(self, stream: ImageStream) -> AsyncIterator[Pictures]:
         self.looking = True
         try:
             yield self
@@ -63,10 +63,10 @@ def board_picture() -> NDArray[np.uint8]:
     return picture.develop(picture.expose(T_CAMERA_BOARD), np.random.default_rng(0))
 
 
-async def test_it_looks_until_it_has_enough() -> None:
+async def test_it_scans_until_it_has_enough_images() -> None:
     source, told = Pictures(board_picture(), EMPTY), list[str]()
     search = BoardSearch(source, "infrared")
-    found = await search.look(BOARD, told.append)
+    found = await search.scan(BOARD, told.append)
     assert np.abs(found.T_world_camera - inverse(T_CAMERA_BOARD)).max() < 2e-3
     assert found.frames_used == GOOD_FRAMES
     assert told[:2] == ["looking for the board: 12 of 12 markers", "looking for the board: 0 of 12 markers"]
@@ -74,18 +74,18 @@ async def test_it_looks_until_it_has_enough() -> None:
     assert search.outcome == ""
 
 
-async def test_a_pose_that_is_not_known_well_takes_more_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_uncertain_pose_takes_more_images(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("edge_unit.calibration.board_scan.GOOD_MM", 0.0)
-    found = await BoardSearch(Pictures(board_picture()), "infrared").look(BOARD, lambda seen: None)
+    found = await BoardSearch(Pictures(board_picture()), "infrared").scan(BOARD, lambda seen: None)
     assert found.frames_used == FRAMES
 
 
-async def test_without_a_board_it_looks_ever_less_often() -> None:
+async def test_without_a_board_it_scans_with_growing_pauses() -> None:
     source, clock = Pictures(EMPTY), SetClock()
     search = BoardSearch(source, "infrared", clock)
     assert search.due
     with pytest.raises(BoardError, match="none of the board's 12 markers"):
-        await search.look(BOARD, lambda seen: None)
+        await search.scan(BOARD, lambda seen: None)
     assert source.taken == EMPTY_FRAMES - 1
     first_ns = clock.now + round(RETRY_MIN_S * S)
     clock.go_to(first_ns - 1)
@@ -93,7 +93,7 @@ async def test_without_a_board_it_looks_ever_less_often() -> None:
     clock.go_to(first_ns)
     assert search.due
     with pytest.raises(BoardError):
-        await search.look(BOARD, lambda seen: None)
+        await search.scan(BOARD, lambda seen: None)
     clock.go_to(first_ns + 2 * round(RETRY_MIN_S * S) - 1)
     assert not search.due
     assert "none of the board's" in search.outcome
@@ -101,13 +101,13 @@ async def test_without_a_board_it_looks_ever_less_often() -> None:
     assert search.due
 
 
-async def test_a_source_without_pictures() -> None:
+async def test_a_source_without_images() -> None:
     search = BoardSearch(object(), "infrared")
     assert not search.due
-    with pytest.raises(BoardError, match="no pictures"):
-        await search.look(BOARD, lambda seen: None)
-    with pytest.raises(SourceError, match="no picture"):
-        await BoardSearch(Pictures(), "infrared").look(BOARD, lambda seen: None)
+    with pytest.raises(BoardError, match="no images"):
+        await search.scan(BOARD, lambda seen: None)
+    with pytest.raises(SourceError, match="delivered no image"):
+        await BoardSearch(Pictures(), "infrared").scan(BOARD, lambda seen: None)
 
 
 @pytest.mark.parametrize("stream", ["infrared", "color"])
@@ -117,7 +117,7 @@ async def test_a_simulated_camera_finds_its_pose_by_the_demo_cells_board(stream:
         camera = await source.open()
         assert camera.T_world_camera is None
         assert demo.board is not None
-        found = await BoardSearch(source, stream).look(demo.board, lambda seen: None)
+        found = await BoardSearch(source, stream).scan(demo.board, lambda seen: None)
     finally:
         await source.close()
     off = inverse(rig(demo, 4)[1]) @ found.T_world_camera
@@ -125,7 +125,7 @@ async def test_a_simulated_camera_finds_its_pose_by_the_demo_cells_board(stream:
     assert np.degrees(angle_rad(off)) < 0.3
 
 
-def test_what_stands_before_the_board_hides_it() -> None:
+def test_an_object_before_the_board_hides_it() -> None:
     world = World.demo(people=0)
     camera = BoardCamera(world, rig(world.cell, 4)[3], "infrared", 0)
     assert camera.intrinsics.shape == camera.take(0.0).shape
@@ -135,6 +135,6 @@ def test_what_stands_before_the_board_hides_it() -> None:
     assert camera._T_image_board is not None
     clear = picture.expose(camera._T_image_board)
     hidden = np.abs(camera.take(0.0) - clear) > 40.0
-    # The tray and the arm are before a good part of it, but not before all.
+    # The tray and the arm hide a good part of it, but not all.
     board_px = np.abs(clear - clear[0, 0]) > 40.0
     assert 0.2 < hidden[board_px].mean() < 0.9

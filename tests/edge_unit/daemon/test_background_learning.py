@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The background of one camera: begun, given up, learned, found again, dropped."""
+"""The background model of one camera: started, given up, learned, loaded, dropped."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_unit.daemon.background_learning import Learning
+from edge_unit.daemon.background_learning import BackgroundLearning
 from edge_unit.daemon.background_store import BackgroundStore, Place
 from edge_unit.pipeline import DepthPipeline
 from edge_unit.sources.frame import CameraInfo
@@ -26,14 +26,14 @@ DEPTH = np.full(CAMERA.shape, 1900, np.uint16)
 
 
 class Student:
-    """One unit's learning, and what became of its commands."""
+    """The background learning of one unit, and the outcomes of its commands."""
 
     def __init__(self, folder: Path, frames: int | None = None) -> None:
         self.told: list[tuple[int, OutcomeCode]] = []
         self.details: list[str] = []
         self.pipeline = DepthPipeline(CAMERA, POSE, Cell("bare", np.full(3, -1.0), np.full(3, 1.0)))
         store = BackgroundStore(folder)
-        self.learning = Learning(store, frames, self.finish)
+        self.learning = BackgroundLearning(store, frames, self.finish)
 
     def finish(self, command: Command, outcome: Outcome) -> None:
         self.told.append((command.id, outcome.code))
@@ -43,7 +43,7 @@ class Student:
         return self.learning.add(self.pipeline, PLACE, DEPTH, None)
 
 
-def test_what_was_learned_is_found_again_and_stays_dropped(tmp_path: Path) -> None:
+def test_a_learned_background_is_loaded_again_and_stays_dropped(tmp_path: Path) -> None:
     one = Student(tmp_path, frames=2)
     one.learning.find(one.pipeline, PLACE)
     assert one.learning.progress == (0, 2)
@@ -67,7 +67,7 @@ def test_what_was_learned_is_found_again_and_stays_dropped(tmp_path: Path) -> No
     assert last.add() is None
 
 
-def test_whoever_asked_is_told_what_became_of_it(tmp_path: Path) -> None:
+def test_each_command_gets_its_outcome(tmp_path: Path) -> None:
     one = Student(tmp_path, frames=1)
     one.learning.begin(one.pipeline, LEARN)
     one.learning.begin(one.pipeline, LEARN)

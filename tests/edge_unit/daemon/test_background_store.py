@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_unit.daemon.background_store import BackgroundStore, Place
-from edge_unit.pipeline import Reference
+from edge_unit.pipeline import BackgroundModel
 from edge_unit.sources.frame import CameraInfo
 from shared.camera import Intrinsics
 from shared.transforms import from_xyz_rpy
@@ -19,13 +19,13 @@ PLACE = Place(CAMERA, POSE)
 
 
 @pytest.fixture
-def reference() -> Reference:
+def reference() -> BackgroundModel:
     depth_m = np.random.default_rng(1).random((6, 8), dtype=np.float32)
     depth_m[0, 0] = np.nan
-    return Reference(depth_m, np.full((6, 8), 0.01, np.float32), 60)
+    return BackgroundModel(depth_m, np.full((6, 8), 0.01, np.float32), 60)
 
 
-def test_a_background_comes_back(tmp_path: Path, reference: Reference) -> None:
+def test_a_background_comes_back(tmp_path: Path, reference: BackgroundModel) -> None:
     store = BackgroundStore(tmp_path / "state")
     assert store.load(PLACE) is None
     store.save(PLACE, reference)
@@ -46,7 +46,9 @@ def test_a_background_comes_back(tmp_path: Path, reference: Reference) -> None:
         Place(CAMERA, from_xyz_rpy((1.0, 2.0, 3.001), (0.1, 0.2, 0.3))),
     ],
 )
-def test_that_of_another_camera_profile_or_pose_is_not_used(tmp_path: Path, reference: Reference, other: Place) -> None:
+def test_that_of_another_camera_profile_or_pose_is_not_used(
+    tmp_path: Path, reference: BackgroundModel, other: Place
+) -> None:
     store = BackgroundStore(tmp_path)
     store.save(PLACE, reference)
     assert store.load(other) is None
@@ -55,24 +57,24 @@ def test_that_of_another_camera_profile_or_pose_is_not_used(tmp_path: Path, refe
 
 @pytest.mark.parametrize("name", ["background.npz", "background.json"])
 @pytest.mark.parametrize("content", [b"", b"{}", b"[]", b"\xff" * 20_000])
-def test_a_damaged_one_is_not_used(tmp_path: Path, reference: Reference, name: str, content: bytes) -> None:
+def test_a_damaged_one_is_not_used(tmp_path: Path, reference: BackgroundModel, name: str, content: bytes) -> None:
     store = BackgroundStore(tmp_path)
     store.save(PLACE, reference)
     (tmp_path / name).write_bytes(content)
     assert store.load(PLACE) is None
 
 
-def test_images_of_one_and_label_of_another_do_not_go_together(tmp_path: Path, reference: Reference) -> None:
+def test_images_of_one_and_label_of_another_do_not_go_together(tmp_path: Path, reference: BackgroundModel) -> None:
     store = BackgroundStore(tmp_path)
     store.save(PLACE, reference)
     label = (tmp_path / "background.json").read_bytes()
-    store.save(PLACE, Reference(reference.depth_m + 1.0, reference.spread_m, 3))
+    store.save(PLACE, BackgroundModel(reference.depth_m + 1.0, reference.spread_m, 3))
     (tmp_path / "background.json").write_bytes(label)
     assert store.load(PLACE) is None
 
 
 def test_a_full_disk_costs_the_file_and_not_the_unit(
-    tmp_path: Path, reference: Reference, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, reference: BackgroundModel, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").write_text("")
     BackgroundStore(tmp_path / "file").save(PLACE, reference)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the master asked for, by when it is carried out."""
+"""The master's commands, sorted by the time of their execution."""
 
 from __future__ import annotations
 
 import asyncio
 
-from edge_unit.daemon.command_batch import Orders, put_back
+from edge_unit.daemon.command_batch import CommandBatch, put_back
 from shared.messages import Command
 
 
@@ -14,8 +14,8 @@ async def test_each_command_has_its_time_and_none_is_lost() -> None:
     calibrate, drop = Command(id=3, verb="calibrate"), Command(id=4, verb="drop_background")
     queue: asyncio.Queue[Command] = asyncio.Queue()
     put_back(queue, (refine, image, calibrate, drop))
-    orders = Orders.take(queue)
-    assert orders == Orders([calibrate], [refine, drop], [image])
+    batch = CommandBatch.take(queue)
+    assert batch == CommandBatch([calibrate], [refine, drop], [image])
     assert queue.empty()
-    put_back(queue, (*orders.changes, *orders.pictures))
-    assert Orders.take(queue) == Orders([], [refine, drop], [image])
+    put_back(queue, (*batch.changes, *batch.pictures))
+    assert CommandBatch.take(queue) == CommandBatch([], [refine, drop], [image])

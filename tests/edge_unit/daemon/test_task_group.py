@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work that no frame waits for."""
+"""Background tasks, which no frame waits for."""
 
 from __future__ import annotations
 
 import asyncio
 
-from edge_unit.daemon.task_group import Errands
+from edge_unit.daemon.task_group import TaskGroup
 
 
-async def test_what_is_not_done_when_the_unit_ends_is_cancelled() -> None:
-    errands, done, cancelled = Errands(), asyncio.Event(), asyncio.Event()
+async def test_unfinished_tasks_are_cancelled_at_the_end() -> None:
+    tasks, done, cancelled = TaskGroup(), asyncio.Event(), asyncio.Event()
 
     async def short() -> None:
         done.set()
@@ -20,9 +20,9 @@ async def test_what_is_not_done_when_the_unit_ends_is_cancelled() -> None:
         finally:
             cancelled.set()
 
-    errands.start(short())
-    errands.start(endless())
+    tasks.start(short())
+    tasks.start(endless())
     await done.wait()
     assert not cancelled.is_set()
-    await errands.end()
+    await tasks.end()
     assert cancelled.is_set()

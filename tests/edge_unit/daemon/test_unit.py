@@ -27,11 +27,11 @@ from edge_unit.calibration.board_scan import RETRY_MIN_S
 from edge_unit.config import PoseConfig, UnitConfig
 from edge_unit.daemon import report as reporting_module
 from edge_unit.daemon import unit as unit_module
-from edge_unit.daemon.frame_processor import FrameWork
+from edge_unit.daemon.frame_processor import FrameProcessor
 from edge_unit.daemon.joint_lookup import FrameJoints
 from edge_unit.daemon.refinement_task import REFINE_FRAMES
 from edge_unit.daemon.unit import FRAME_S_MAX, Unit
-from edge_unit.daemon.warm_up import rehearse
+from edge_unit.daemon.warm_up import warm_up_kernels
 from edge_unit.monitoring import read_trace
 from edge_unit.sources.frame import CameraInfo, DepthFrame
 from edge_unit.sources.image import ImageFrame, ImageInfo, ImageStream
@@ -93,7 +93,7 @@ def patch(depth_mm: int, column: int = 24) -> NDArray[np.uint16]:
 @pytest.fixture(scope="module", autouse=True)
 def compiled() -> None:
     """In a checkout that is new, kernels are compiled here and not while a test counts seconds."""
-    rehearse()
+    warm_up_kernels()
 
 
 class FakeSource:
@@ -299,7 +299,7 @@ async def test_a_frame_that_hangs_is_told_and_waiting_for_a_camera_is_not(
         await bench.until(lambda: bench.source.opened >= 2, "a camera that is opened again")
         bench.show(patch(1225))
         await bench.until(lambda: (row := bench.row()) and row.health.frame == 1, "a frame")
-        monkeypatch.setattr(FrameWork, "process", lambda *_: entered.set() or release.wait(PATIENCE_S))
+        monkeypatch.setattr(FrameProcessor, "process", lambda *_: entered.set() or release.wait(PATIENCE_S))
         bench.show(patch(1225))
         await bench.until(entered.is_set, "a frame that is begun")
         bench.clock.go_to(bench.clock.now + round(FRAME_S_MAX * S))
@@ -307,7 +307,7 @@ async def test_a_frame_that_hangs_is_told_and_waiting_for_a_camera_is_not(
         bench.clock.go_to(bench.clock.now + 1 * S)
         stuck = bench.unit.stuck()
         assert stuck is not None
-        assert stuck.startswith(f"frame 2 has not come to its end for {FRAME_S_MAX + 1.0:.0f} s")
+        assert stuck.startswith(f"frame 2 has not finished for {FRAME_S_MAX + 1.0:.0f} s")
         release.set()
 
 
@@ -449,13 +449,13 @@ async def test_another_master_never_gets_voxels_of_the_first_ones_lattice(tmp_pa
 async def test_joints_of_the_frames_time_reach_the_pipeline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = await asyncio.to_thread(Bench, tmp_path, with_robot=True)
     used: list[Any] = []
-    report = FrameWork._report
+    report = FrameProcessor._report
 
     def spy(work: Any, pipeline: Any, assignment: Any, frame: Any, joints: Any, stages: Any) -> Any:
         used.append(joints)
         return report(work, pipeline, assignment, frame, joints, stages)
 
-    monkeypatch.setattr(FrameWork, "_report", spy)
+    monkeypatch.setattr(FrameProcessor, "_report", spy)
     async with bench.running():
         bench.show(patch(FAR_MM))
         await bench.until(lambda: used, "a frame without joints")
@@ -477,7 +477,7 @@ async def test_joints_whose_times_are_late_are_looked_up_later(tmp_path: Path, m
     """The robot turns at 1 rad/s; the delay is told while the unit runs."""
     bench = await asyncio.to_thread(Bench, tmp_path, with_robot=True)
     ahead_s: list[float | None] = []
-    report = FrameWork._report
+    report = FrameProcessor._report
     began_ns = bench.clock.now
 
     def turned(at_ns: int) -> float:
@@ -501,7 +501,7 @@ async def test_joints_whose_times_are_late_are_looked_up_later(tmp_path: Path, m
             if ahead_s[-1] is not None:
                 return ahead_s[-1]
 
-    monkeypatch.setattr(FrameWork, "_report", spy)
+    monkeypatch.setattr(FrameProcessor, "_report", spy)
     async with bench.running():
         assert await ahead() == pytest.approx(0.0, abs=1e-3)
         bench.master.change_settings({"joint_delay_s": 0.05})
@@ -777,7 +777,7 @@ class LookingSource(FakeSource):
         self.looks = 0
 
     @contextlib.asynccontextmanager
-    async def look(self, stream: ImageStream) -> AsyncIterator[LookingSource]:
+    async def open_images(self, stream: ImageStream) -> AsyncIterator[LookingSource]:
         self.looks += 1
         yield self
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is rehearsed is all that the first frame needs."""
+"""The warm-up compiles all that the first frame needs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import sys
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from edge_unit.daemon.warm_up import rehearse
+from edge_unit.daemon.warm_up import warm_up_kernels
 from edge_unit.pipeline import DepthPipeline
 from geometry import kernels
 from shared.transforms import look_at
@@ -19,7 +19,7 @@ from tests.edge_unit.scenes import camera, demo_cell
 
 
 def compiled() -> dict[str, int]:
-    """How many types each kernel is ready for."""
+    """Return the number of types that each kernel is compiled for."""
     return {
         f"{module.name}.{name}": len(value.signatures)
         for module in pkgutil.iter_modules(kernels.__path__, f"{kernels.__name__}.")
@@ -29,7 +29,7 @@ def compiled() -> dict[str, int]:
 
 
 def first_frame() -> None:
-    """Of the demo cell, with its robot."""
+    """Return the first frame of the demo cell, with its robot."""
     cell = demo_cell()
     pipeline = DepthPipeline(camera(), look_at((2.0, 0.0, 1.5), (0.0, 0.0, 0.0)), cell)
     assert cell.robot is not None
@@ -37,18 +37,21 @@ def first_frame() -> None:
 
 
 def test_the_first_frame_needs_no_kernel_that_was_not_rehearsed() -> None:
-    # In a process of its own, for other tests use kernels too.
+    # In a process of its own, as other tests use kernels too.
     subprocess.run([sys.executable, "-m", "tests.edge_unit.daemon.test_warm_up"], check=True, timeout=110)
 
 
 def test_no_reader_of_meshes_is_imported_for_it() -> None:
     # Half a second, which would be half of a start.
-    code = "import sys; from edge_unit.daemon.warm_up import rehearse; rehearse(); sys.exit('trimesh' in sys.modules)"
+    code = (
+        "import sys; from edge_unit.daemon.warm_up import warm_up_kernels; warm_up_kernels(); "
+        "sys.exit('trimesh' in sys.modules)"
+    )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=110)
 
 
 if __name__ == "__main__":
-    rehearse()
+    warm_up_kernels()
     ready = compiled()
     assert sum(count > 0 for count in ready.values()) > 10, ready
     first_frame()

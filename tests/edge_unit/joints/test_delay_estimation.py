@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How late the joints are, told by frames of a robot that moves; before a real master it is told as a warning."""
+"""The joints' delay, estimated from frames of a robot that moves; with a real master it is reported as a warning."""
 
 from __future__ import annotations
 
@@ -14,7 +14,15 @@ import yaml
 from numpy.typing import NDArray
 
 from edge_unit.__main__ import main
-from edge_unit.joints import DelayEstimate, DelayLook, DelayWatch, JointHistory, delay_monitor, estimate_delay, look_at
+from edge_unit.joints import (
+    DelayComparison,
+    DelayEstimate,
+    DelayMonitor,
+    JointHistory,
+    compare_frame,
+    delay_monitor,
+    estimate_delay,
+)
 from edge_unit.joints.delay_estimation import LOOKS_MIN
 from edge_unit.joints.delay_from_recording import JointSamples
 from edge_unit.joints.delay_monitor import PERIOD_NS
@@ -48,7 +56,7 @@ def pipeline(world: World) -> DepthPipeline:
 
 @pytest.fixture(scope="module")
 def frames(world: World) -> list[Frame]:
-    """Eight seconds with someone who walks by."""
+    """Eight seconds with a person who walks by."""
     camera = SimulatedCamera(world, POSE, INTRINSICS)
     return [(camera.capture(number * PERIOD_S).depth, number * PERIOD_S) for number in range(40)]
 
@@ -58,8 +66,10 @@ def looks(
 ) -> list[NDArray[np.float64]]:
     robot = pipeline.cell.robot
     assert robot is not None
-    look = DelayLook(INTRINSICS, POSE, robot, pipeline.expected_depth(None), FilterSettings())
-    found = [look_at(look, depth, t_s, lambda at_s: path.joints_at(at_s - delay_s)) for depth, t_s in frames]
+    comparison = DelayComparison(INTRINSICS, POSE, robot, pipeline.expected_depth(None), FilterSettings())
+    found = [
+        compare_frame(comparison, depth, t_s, lambda at_s: path.joints_at(at_s - delay_s)) for depth, t_s in frames
+    ]
     return [misfits for misfits in found if misfits is not None]
 
 
@@ -71,20 +81,20 @@ def test_the_delay_is_found_within_5_ms(pipeline: DepthPipeline, frames: list[Fr
     assert found.looks >= LOOKS_MIN
 
 
-def test_a_robot_that_hardly_moves_tells_nothing(pipeline: DepthPipeline, frames: list[Frame]) -> None:
+def test_a_robot_that_hardly_moves_gives_no_estimate(pipeline: DepthPipeline, frames: list[Frame]) -> None:
     assert looks(pipeline, frames, 0.0, RobotPath.still(PATH.joints_at(0.0))) == []
     with pytest.raises(InputError, match="hardly moved"):
         estimate_delay([])
 
 
-def test_a_delay_beyond_what_is_tried_is_refused(pipeline: DepthPipeline, frames: list[Frame]) -> None:
+def test_a_delay_beyond_the_tried_range_is_refused(pipeline: DepthPipeline, frames: list[Frame]) -> None:
     with pytest.raises(InputError, match="the same clock"):
         estimate_delay(looks(pipeline, frames, 0.24))
 
 
 def test_a_running_unit_warns_of_a_delay_that_is_off(pipeline: DepthPipeline, frames: list[Frame]) -> None:
     """Joints come 60 ms late, without times; frames are kept until those are known."""
-    watch, history = DelayWatch(), JointHistory()
+    watch, history = DelayMonitor(), JointHistory()
     began_ns, told = 100 * NS_PER_S, []
     # Slower than the frames were taken, so that each is due.
     slow = PERIOD_NS / NS_PER_S / PERIOD_S
@@ -94,14 +104,14 @@ def test_a_running_unit_warns_of_a_delay_that_is_off(pipeline: DepthPipeline, fr
         assert watch.due(at_ns)
         watch.keep(pipeline, depth, at_ns)
         assert not watch.due(at_ns + PERIOD_NS // 2)
-        assert watch.next_look(history) is None
+        assert watch.next_comparison(history) is None
         for step in range(round(PERIOD_NS / NS_PER_S / 0.008)):
             t_s = frame_s * slow + 0.008 * step - 0.1
             late_ns = began_ns + round((t_s + 0.06) * NS_PER_S)
             history.add([JointSample(late_ns, tuple(path.joints_at(t_s).tolist()), None)])
-        look = watch.next_look(history)
-        if look is not None:
-            look()
+        comparison = watch.next_comparison(history)
+        if comparison is not None:
+            comparison()
         told.append(watch.warning(0.0))
     assert told[: LOOKS_MIN - 1] == [None] * (LOOKS_MIN - 1)
     assert told[-1] is not None
@@ -113,12 +123,12 @@ def test_a_running_unit_warns_of_a_delay_that_is_off(pipeline: DepthPipeline, fr
     assert len(told[-1]) < 200
 
 
-def test_looks_come_one_by_one_and_those_of_another_background_do_not_count(
+def test_comparisons_run_one_by_one_and_those_of_another_background_do_not_count(
     world: World, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pipeline = DepthPipeline(INTRINSICS, POSE, world.cell)
     monkeypatch.setattr(delay_monitor, "estimate_delay", lambda misfits: DelayEstimate(1.0, 0.0, len(misfits)))
-    watch, history = DelayWatch(), JointHistory()
+    watch, history = DelayMonitor(), JointHistory()
     depth, frame_s = frames[3]
     for step in range(150):
         t_s = frame_s - 0.2 + 0.008 * step
@@ -126,44 +136,46 @@ def test_looks_come_one_by_one_and_those_of_another_background_do_not_count(
 
     def kept_look() -> Callable[[], None] | None:
         watch.keep(pipeline, depth, NS_PER_S + round(frame_s * NS_PER_S))
-        return watch.next_look(history)
+        return watch.next_comparison(history)
 
     first = kept_look()
     assert first is not None
-    assert watch.next_look(history) is None
-    # Until it is done there is no other, and a frame that is kept meanwhile waits for it.
+    assert watch.next_comparison(history) is None
+    # Until it is done there is no other comparison, and a frame that is kept meanwhile waits for it.
     assert kept_look() is None
     first()
     assert watch.warning(0.0) is not None
-    second = watch.next_look(history)
+    second = watch.next_comparison(history)
     assert second is not None
     pipeline.move(camera_at((0.9, 0.1, 1.2), (0.25, 0.0, 0.2)))
     watch.keep(pipeline, depth, NS_PER_S + round(frame_s * NS_PER_S))
     second()
     assert watch.warning(0.0) is None
-    third = watch.next_look(history)
+    third = watch.next_comparison(history)
     assert third is not None
     third()
     assert watch.warning(0.0) is not None
 
 
 def test_a_frame_that_is_kept_is_a_copy(pipeline: DepthPipeline, frames: list[Frame]) -> None:
-    """The source uses its memory again, and the pipeline goes on while the look is taken."""
+    """The source uses its memory again, and the pipeline goes on during the comparison."""
     depth, frame_s = frames[3]
     robot = pipeline.cell.robot
     assert robot is not None
     static_m = pipeline.expected_depth(None)
-    look = DelayLook(INTRINSICS, POSE, robot, static_m, FilterSettings())
+    comparison = DelayComparison(INTRINSICS, POSE, robot, static_m, FilterSettings())
     joints = [PATH.joints_at(frame_s)]
     before = depth.copy()
-    thinned_m = look.thinned(before)
-    expected = look.misfits(thinned_m, joints)
+    thinned_m = comparison.thinned(before)
+    expected = comparison.misfits(thinned_m, joints)
     before[:] = 0
     static_m[:] = 0.0
-    np.testing.assert_array_equal(look.misfits(thinned_m, joints), expected)
+    np.testing.assert_array_equal(comparison.misfits(thinned_m, joints), expected)
 
 
-def test_a_recording_tells_its_delay(frames: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_delay_of_a_recording_is_estimated(
+    frames: list[Frame], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "recording"
     (folder / "depth").mkdir(parents=True)
     for number, (depth, _) in enumerate(frames):
@@ -187,7 +199,7 @@ def test_a_recording_tells_its_delay(frames: list[Frame], tmp_path: Path, capsys
     assert "joint_samples.csv: expected rows of 7 numbers" in capsys.readouterr().err
 
 
-def test_samples_are_interpolated_where_they_are_dense() -> None:
+def test_dense_samples_are_interpolated() -> None:
     samples = JointSamples(np.array(((0.0, 1.0), (0.1, 2.0), (0.9, 3.0))), Path("samples.csv"))
     assert samples.at(0.05) == pytest.approx([1.5])
     assert samples.at(0.5) is None

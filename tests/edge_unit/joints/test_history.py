@@ -20,7 +20,7 @@ STALE_S = 0.5
 
 
 def history(*samples: tuple[float, float], velocity: float | None = None) -> JointHistory:
-    """Of one joint: (time in ms, position)."""
+    """Samples of one joint: (time in ms, position)."""
     made = JointHistory()
     velocities = None if velocity is None else (velocity,)
     made.add(JointSample(round(at_ms * MS), (position,), velocities) for at_ms, position in samples)
@@ -51,7 +51,7 @@ def test_a_robot_at_rest_is_certain() -> None:
     assert found.uncertainty.tolist() == [0.0]
 
 
-def test_after_the_newest_it_goes_on_at_the_last_speed_and_tells_how_wrong_that_may_be() -> None:
+def test_after_the_newest_it_extrapolates_with_an_uncertainty() -> None:
     known = history(*((1000 + 8 * i, 0.008 * i) for i in range(10)))
     found = at(known, 1172)
     assert found.positions == pytest.approx([0.172])
@@ -64,7 +64,7 @@ def test_the_robots_own_velocity_is_believed() -> None:
 
 
 def test_samples_that_come_in_bursts_do_not_make_the_robot_faster() -> None:
-    """At 1 rad/s and 8 ms a sample, held up by as much as 20 ms: times are those of arrival."""
+    """At 1 rad/s and 8 ms a sample, delayed by up to 20 ms: times are those of arrival."""
     arrivals_ms = (1000, 1008, 1016, 1024, 1032, 1058, 1058.2, 1058.4, 1064, 1072, 1100, 1100.1)
     known = history(*((at_ms, 0.008 * i) for i, at_ms in enumerate(arrivals_ms)))
     found = at(known, 1130)
@@ -73,7 +73,7 @@ def test_samples_that_come_in_bursts_do_not_make_the_robot_faster() -> None:
 
 
 def test_between_samples_with_velocities_it_follows_their_curve() -> None:
-    """At 30 Hz a robot that turns back is nowhere on the chord."""
+    """At 30 Hz a robot that turns back deviates from the chord."""
     omega = 8.0
     known = JointHistory()
     for step in range(20):
@@ -124,8 +124,8 @@ def test_one_sample_alone_may_be_moving() -> None:
     assert known.at(1060 * MS, 0, STALE_S) is None
 
 
-def test_samples_too_far_apart_tell_nothing_of_between() -> None:
-    """Else a robot that stood still would hide who stands beside it."""
+def test_samples_too_far_apart_are_not_interpolated() -> None:
+    """Otherwise a robot at rest would hide a person beside it."""
     assert at(history((1000, 0.0), (1190, 0.0)), 1100).uncertainty[0] <= UNCERTAINTY_MAX
     apart = history((1000, 0.0), (1210, 0.0))
     assert apart.at(1100 * MS, 0, STALE_S) is None
@@ -137,7 +137,7 @@ def test_a_joint_too_fast_for_its_time_is_not_known() -> None:
     assert fast.at(1005 * MS, 5 * MS, STALE_S) is None
 
 
-def test_what_is_known_already_is_passed_over() -> None:
+def test_known_samples_are_skipped() -> None:
     known = history((1000, 0.0), (1010, 0.1))
     known.add([JointSample(1005 * MS, (9.0,), None), JointSample(1010 * MS, (9.0,), None)])
     assert at(known, 1010).positions == pytest.approx([0.1])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which camera the master is told of."""
+"""The camera that is reported to the master."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from edge_unit.config import UnitConfig
-from edge_unit.monitoring import CameraStanding
+from edge_unit.monitoring import CameraStatus
 from edge_unit.monitoring.last_camera import CameraMemory
 from edge_unit.sources.frame import CameraInfo
 from edge_unit.sources.realsense.source import RealsenseSourceConfig
@@ -23,7 +23,7 @@ CAMERA = CameraInfo("123", "D435", Intrinsics(848, 480, 424.1, 424.2, 423.9, 239
 
 
 class Told:
-    """Stands for the uplink."""
+    """Replaces the uplink."""
 
     def __init__(self) -> None:
         self.cameras: list[CameraInfo] = []
@@ -33,9 +33,9 @@ class Told:
         self.cameras.append(camera)
 
 
-def standing(folder: Path, serial: str | None = None) -> tuple[CameraStanding, Any]:
+def standing(folder: Path, serial: str | None = None) -> tuple[CameraStatus, Any]:
     told: Any = Told()
-    return CameraStanding(UnitConfig(source=RealsenseSourceConfig(serial=serial), state_dir=folder), told), told
+    return CameraStatus(UnitConfig(source=RealsenseSourceConfig(serial=serial), state_dir=folder), told), told
 
 
 @pytest.mark.parametrize(("wanted", "expected"), [(None, [CAMERA]), ("123", [CAMERA]), ("456", [])])

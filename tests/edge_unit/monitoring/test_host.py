@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the board tells of itself."""
+"""Facts of the computer."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TIME_ERROR = 5
 """What adjtimex(2) returns of a clock that nobody keeps right, whatever its structure says; less is right."""
 
 
-def test_the_kernel_knows_whether_its_clock_is_set() -> None:
+def test_the_kernel_reports_the_state_of_its_clock() -> None:
     told = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512))
     assert clock_is_set() == (0 <= told < TIME_ERROR)
 

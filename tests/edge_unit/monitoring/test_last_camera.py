@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera that was here before."""
+"""The camera of the last run."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def test_a_damaged_file_is_as_good_as_none(tmp_path: Path, text: str, caplog: py
     assert "camera.json: ignored" in caplog.text
 
 
-def test_what_cannot_be_written_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failed_write_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "state").write_text("a file where a folder should be")
     CameraMemory(tmp_path / "state").save(CAMERA)
     assert "camera.json: cannot be written" in caplog.text
 
 
-def test_what_is_written_can_be_read(tmp_path: Path) -> None:
+def test_a_written_file_can_be_read(tmp_path: Path) -> None:
     CameraMemory(tmp_path).save(CAMERA)
     assert (tmp_path / "camera.json").stat().st_size < STATE_MAX_BYTES / 5

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_unit.monitoring import Stance, Verdict, place_of
-from edge_unit.monitoring.pose_monitor import BASELINE_LOOKS, FILE_NAME, PERIOD_S, WINDOW
+from edge_unit.monitoring import PoseMonitor, Verdict, place_of
+from edge_unit.monitoring.pose_monitor import BASELINE_LOOKS, FILE_NAME, OLD_FILE_NAME, PERIOD_S, WINDOW
 from edge_unit.pipeline import DepthPipeline, Misfit
 from shared.transforms import Transform, from_xyz_rpy
 from simulation.cameras.camera import SimulatedCamera, d435i_intrinsics, rig
@@ -36,12 +36,12 @@ class Watched:
         self.restart()
 
     def restart(self) -> None:
-        """As a unit that was switched off and on."""
-        self.stance = Stance(self.folder)
+        """Start anew, like a unit that was switched off and on."""
+        self.stance = PoseMonitor(self.folder)
         self.stance.begin(place_of("SERIAL", EYE.shape, self.pose))
 
     def looks(self, count: int, knock: Transform = HERE, share: float = 1.0) -> Iterator[Verdict]:
-        """Verdicts of `count` looks from `knock` beside its place, with the picture right of `share` covered."""
+        """Yield verdicts of `count` checks from `knock` beside its place; the image right of `share` is covered."""
         eye = SimulatedCamera(self.world, self.pose @ knock, EYE, seed=self.number)
         for _ in range(count):
             frame = eye.capture(self.t_s)
@@ -72,7 +72,7 @@ KNOCKS = {
 
 
 @pytest.mark.parametrize("knock", KNOCKS)
-def test_a_knocked_camera_is_told_within_two_seconds_and_recovers(watched: Watched, knock: str) -> None:
+def test_a_knocked_camera_is_reported_within_two_seconds_and_recovers(watched: Watched, knock: str) -> None:
     reasons = [verdict.reason for verdict in watched.looks(WINDOW, KNOCKS[knock])]
     assert reasons[-1]
     assert PERIOD_S * WINDOW < 2.0
@@ -141,7 +141,21 @@ def test_a_damaged_file_is_passed_over(watched: Watched, text: str) -> None:
     assert set(watched.looks(BASELINE_LOOKS)) == {Verdict()}
 
 
-def test_without_known_surfaces_nothing_is_told(watched: Watched) -> None:
+def test_the_file_of_former_versions_is_read(watched: Watched) -> None:
+    usual = watched.stance._usual
+    assert usual is not None
+    (watched.folder / FILE_NAME).rename(watched.folder / OLD_FILE_NAME)
+    watched.restart()
+    assert watched.stance._usual is not None
+    assert watched.stance._usual.slope == pytest.approx(usual.slope)
+    watched.last(2 * BASELINE_LOOKS)
+    assert (watched.folder / FILE_NAME).exists()
+    (watched.folder / OLD_FILE_NAME).write_text("{}")
+    watched.restart()
+    assert watched.stance._usual is not None
+
+
+def test_without_known_surfaces_there_is_no_verdict(watched: Watched) -> None:
     watched.stance.judge(misfit_of(watched), 99, 0)
     bare = replace(misfit_of(watched), static_share=0.0, slope=np.full(6, 0.5))
     verdicts = {watched.stance.judge(bare, 99, n) for n in range(WINDOW)}
@@ -149,14 +163,14 @@ def test_without_known_surfaces_nothing_is_told(watched: Watched) -> None:
 
 
 def misfit_of(watched: Watched) -> Misfit:
-    """That of a frame in which nothing is out of place."""
+    """Return the misfit of a frame in which nothing is out of place."""
     list(watched.looks(1))
     assert watched.misfit is not None
     return watched.misfit
 
 
-def test_looks_are_due_again_after_a_while_and_when_time_begins_anew(tmp_path: Path) -> None:
-    stance = Stance(tmp_path)
+def test_checks_are_due_after_a_period_and_after_a_clock_restart(tmp_path: Path) -> None:
+    stance = PoseMonitor(tmp_path)
     look = Misfit(np.zeros(6), np.ones(6), 1.0, 0.0, 1.0)
     assert stance.due(10_000_000_000)
     stance.judge(look, 0, 10_000_000_000)

@@ -53,9 +53,9 @@ def test_a_path_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"\xc1", b"\x01", b"\x81\xa1a\x01"])
-def test_what_is_no_trace_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_a_file_that_is_not_a_trace_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "trace").write_bytes(content)
-    with pytest.raises(ConfigError, match="no trace"):
+    with pytest.raises(ConfigError, match="expected a trace"):
         read_trace(tmp_path / "trace")
     with pytest.raises(ConfigError, match="gone"):
         read_trace(tmp_path / "gone")

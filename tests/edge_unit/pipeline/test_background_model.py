@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import edge_unit.pipeline.background_model
-from edge_unit.pipeline import DepthPipeline, Reference, ReferenceLearner
+from edge_unit.pipeline import BackgroundLearner, BackgroundModel, DepthPipeline
 from shared.cell import Cell, PlacedMesh
 from shared.errors import InputError
 from shared.meshes import box_mesh, cylinder_mesh
@@ -46,7 +46,7 @@ COLUMN = np.isfinite(raycast(bodies(small_cell(floor=False), [0.0])[:1], OVERHEA
 
 
 def look(*things: PlacedMesh, joints: float | None = None, noise: np.random.Generator | None = None) -> Depth:
-    """What the camera measures of the room, of `things`, and of the robot if it is there."""
+    """Return the camera's depth of the room, of `things`, and of the robot if joints are given."""
     robot = bodies(small_cell(floor=False), None if joints is None else [joints])
     depth_m = raycast([*ROOM, *things, *robot], OVERHEAD, CAMERA)
     if noise is not None:
@@ -58,7 +58,7 @@ def pipeline(robot: bool = True) -> DepthPipeline:
     return DepthPipeline(CAMERA, OVERHEAD, small_cell(robot=robot, floor=False))
 
 
-def test_what_was_learned_is_no_obstacle_and_what_comes_after_is() -> None:
+def test_a_learned_surface_is_no_obstacle_and_a_new_one_is() -> None:
     empty = pipeline(robot=False)
     rng = np.random.default_rng(0)
     assert len(empty.process(look(), None).voxels) > 10
@@ -79,8 +79,8 @@ def test_the_expected_depth_is_the_learned_one() -> None:
     assert np.allclose(expected_m, look() / 1000.0, atol=1e-3)
 
 
-def test_who_crosses_while_it_learns_is_still_reported() -> None:
-    """He covers each pixel of his way for 5 of 60 frames."""
+def test_a_person_who_crosses_during_learning_is_still_reported() -> None:
+    """The person covers each pixel on the way for 5 of 60 frames."""
     empty = pipeline(robot=False)
     rng = np.random.default_rng(0)
 
@@ -97,7 +97,7 @@ def test_who_crosses_while_it_learns_is_still_reported() -> None:
     assert len(empty.process(look(noise=rng), None).voxels) == 0
 
 
-def test_who_crosses_where_nothing_is_measured_is_still_reported() -> None:
+def test_a_person_who_crosses_unmeasured_pixels_is_still_reported() -> None:
     empty = pipeline(robot=False)
 
     def frames() -> Iterator[tuple[Depth, None]]:
@@ -117,10 +117,10 @@ def test_the_robots_shadow_fills_in_as_it_moves() -> None:
     moved = watched.learn((look(joints=angle), [angle]) for angle in np.linspace(0.0, 2.0, 9))
     shadow = ~np.isfinite(still.depth_m)
     assert 100 < shadow.sum() < 0.4 * shadow.size
-    # All but the hub, about which the arm turns.
+    # All but the hub, which the arm turns about.
     unlearned = ~np.isfinite(moved.depth_m)
     assert (unlearned & ~grown(COLUMN, 3)).sum() == 0
-    # And what filled in is the room, not the robot.
+    # The room filled in, not the robot.
     room_m = look() / 1000.0
     filled = shadow & ~unlearned & ~COLUMN
     assert (np.abs(moved.depth_m[filled] - room_m[filled]) < 0.01).mean() > 0.98
@@ -131,7 +131,7 @@ def test_the_fixed_base_leaves_no_unlearned_ring() -> None:
     watched = pipeline()
     reference = watched.learn((look(joints=angle), [angle]) for angle in np.linspace(0.0, 2.0, 9))
     ring = grown(COLUMN, 3) & ~COLUMN
-    # But for a pixel or two beside the hub.
+    # Except for a pixel or two beside the hub.
     assert np.isfinite(reference.depth_m[ring]).mean() > 0.97
     watched.use(reference)
     assert not watched.foreground(look(joints=-2.5), [-2.5])[ring].any()
@@ -139,7 +139,7 @@ def test_the_fixed_base_leaves_no_unlearned_ring() -> None:
 
 
 def test_the_robot_is_not_learned() -> None:
-    """Where it stood while the unit learned, somebody's hand is reported once it is gone."""
+    """A hand at the robot's position during learning is reported after the robot has left."""
     watched = pipeline()
     watched.use(watched.learn((look(joints=0.5), [0.5]) for _ in range(10)))
     arm = shrunk(np.isfinite(raycast(bodies(small_cell(floor=False), [0.5])[1:], OVERHEAD, CAMERA))) & ~grown(COLUMN, 2)
@@ -159,7 +159,7 @@ def test_learning_from_no_frame_is_refused() -> None:
 
 
 def test_learning_disturbs_no_frame_between() -> None:
-    """A unit learns while it works: the links that are left out while learning are filtered all the same."""
+    """A unit learns while it works: links that learning leaves out are filtered all the same."""
     watched = pipeline()
     before = watched.foreground(look(joints=0.5), [0.5])
     learner = watched.learner()
@@ -168,7 +168,7 @@ def test_learning_disturbs_no_frame_between() -> None:
         assert (watched.foreground(look(joints=0.5), [0.5]) == before).all()
 
 
-# ---------------------------------------------------------------- when the reference is void
+# ---------------------------------------------------------------- a void background model
 
 
 def test_it_is_void_when_the_camera_moved_and_kept_when_its_pose_is_refined() -> None:
@@ -196,7 +196,7 @@ def test_it_outlives_new_settings_and_a_new_cell() -> None:
 
 
 def test_one_of_another_resolution_is_refused() -> None:
-    other = Reference(np.ones((3, 4), np.float32), np.ones((3, 4), np.float32), 1)
+    other = BackgroundModel(np.ones((3, 4), np.float32), np.ones((3, 4), np.float32), 1)
     empty = pipeline(robot=False)
     with pytest.raises(InputError, match=r"\(90, 160\).*\(3, 4\)"):
         empty.use(other)
@@ -206,17 +206,17 @@ def test_one_of_another_resolution_is_refused() -> None:
 # ---------------------------------------------------------------- bytes
 
 
-def some_reference() -> Reference:
+def some_reference() -> BackgroundModel:
     rng = np.random.default_rng(0)
     depth_m = rng.uniform(0.5, 4.0, (24, 42)).astype(np.float32)
     depth_m[rng.random(depth_m.shape) < 0.2] = np.nan
-    return Reference(depth_m, rng.uniform(0.0, 0.1, depth_m.shape).astype(np.float32), 17)
+    return BackgroundModel(depth_m, rng.uniform(0.0, 0.1, depth_m.shape).astype(np.float32), 17)
 
 
 def test_save_and_load(tmp_path: Path) -> None:
     reference = some_reference()
     reference.save(tmp_path / "empty.npz")
-    loaded = Reference.load(tmp_path / "empty.npz")
+    loaded = BackgroundModel.load(tmp_path / "empty.npz")
     assert np.array_equal(loaded.depth_m, reference.depth_m, equal_nan=True)
     assert np.array_equal(loaded.spread_m, reference.spread_m)
     assert loaded.frames == 17
@@ -229,14 +229,14 @@ def test_a_file_that_is_no_reference_is_one_error_that_names_it(tmp_path: Path, 
     if content is not None:
         file.write_bytes(content)
     with pytest.raises(InputError, match=r"empty\.npz"):
-        Reference.load(file)
+        BackgroundModel.load(file)
 
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(edge_unit.pipeline.background_model, "FILE_BYTES_MAX", 100)
     some_reference().save(tmp_path / "empty.npz")
     with pytest.raises(InputError, match="at most 100 bytes"):
-        Reference.load(tmp_path / "empty.npz")
+        BackgroundModel.load(tmp_path / "empty.npz")
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -249,7 +249,7 @@ def test_damaged_bytes_are_an_input_error_or_nothing() -> None:
         for place in rng.integers(0, max(len(damaged), 1), rng.integers(1, 4)):
             damaged[place : place + 1] = bytes([rng.integers(256)])
         try:
-            Reference.from_bytes(bytes(damaged))
+            BackgroundModel.from_bytes(bytes(damaged))
         except InputError:
             refused += 1
     assert refused > 2500
@@ -284,16 +284,16 @@ def images(depth_m: float, spread_m: float = 0.01) -> dict[str, NDArray[np.float
     ],
 )
 def test_contents_that_make_no_sense_are_refused(arrays: dict[str, Any]) -> None:
-    """A depth below 0, say, would hide the whole cell."""
+    """A depth below 0, for example, would hide the whole cell."""
     with pytest.raises(InputError, match="reference: expected"):
-        Reference.from_bytes(npz(**arrays))
+        BackgroundModel.from_bytes(npz(**arrays))
 
 
 def test_bytes_of_a_single_array_are_refused() -> None:
     buffer = io.BytesIO()
     np.save(buffer, np.ones(3))
     with pytest.raises(InputError, match="reference: expected"):
-        Reference.from_bytes(buffer.getvalue())
+        BackgroundModel.from_bytes(buffer.getvalue())
 
 
 # ---------------------------------------------------------------- the learner
@@ -301,7 +301,7 @@ def test_bytes_of_a_single_array_are_refused() -> None:
 
 def test_a_learner_takes_no_more_frames_than_it_can_count(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(edge_unit.pipeline.background_model, "MAX_FRAMES", 2)
-    learner = ReferenceLearner(CAMERA, 0.01, 10.0)
+    learner = BackgroundLearner(CAMERA, 0.01, 10.0)
     for _ in range(2):
         learner.add(look(), *NO_ROBOT)
     with pytest.raises(InputError, match="at most 2 frames"):
@@ -311,7 +311,7 @@ def test_a_learner_takes_no_more_frames_than_it_can_count(monkeypatch: pytest.Mo
 
 def test_a_learner_without_frames_has_no_reference() -> None:
     with pytest.raises(InputError, match="at least one frame"):
-        ReferenceLearner(CAMERA, 0.01, 10.0).reference()
+        BackgroundLearner(CAMERA, 0.01, 10.0).reference()
 
 
 def test_a_robot_without_moving_links_is_learned_with_the_rest() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Python block of the design's contract runs as it stands, on the demo cell."""
+"""The Python block of the design's contract runs unchanged, on the demo cell."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ pipeline.use(reference)
 
 
 def blocks() -> list[Any]:
-    """Our copy, and the design's own block where the design lies beside the checkout."""
+    """Yield the test's copy, and the design's own block if the design lies beside the checkout."""
     found = [pytest.param(BLOCK, id="copy")]
     if DESIGN.is_file():
         contract = DESIGN.read_text().split("## The contract", 1)[1]
@@ -75,7 +75,7 @@ def what_it_is_given(joints: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("joints", [HOME_RAD, HOME_RAD.tolist(), None], ids=["array", "list", "none"])
 @pytest.mark.parametrize("block", blocks())
-def test_the_block_runs_as_it_stands(block: str, joints: Any) -> None:
+def test_the_block_runs_unchanged(block: str, joints: Any) -> None:
     names = what_it_is_given(joints)
     exec(compile(block, "contract", "exec"), names)
     voxels, pipeline, shape = names["voxels"], names["pipeline"], names["intrinsics"].shape
@@ -104,7 +104,7 @@ def test_the_block_runs_as_it_stands(block: str, joints: Any) -> None:
 
 
 def test_the_names_that_others_build_on() -> None:
-    """As the block's comments have them."""
+    """Check the types and shapes in the block's comments."""
     intrinsics = Intrinsics(424, 240, 213.7, 213.7, 211.5, 119.5)
     assert intrinsics.depth_scale_m == 0.001
     assert Intrinsics(424, 240, 213.7, 213.7, 211.5, 119.5, depth_scale_m=0.0001).depth_scale_m == 0.0001

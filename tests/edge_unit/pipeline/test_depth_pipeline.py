@@ -55,7 +55,7 @@ def pipeline(cell: Cell | None = None, **settings: Any) -> DepthPipeline:
 def look(
     *things: Any, joints: float = 0.3, cell: Cell | None = None, noise: np.random.Generator | None = None
 ) -> Depth:
-    """What the camera measures of the small cell, its robot and `things`."""
+    """Return the camera's depth of the small cell, its robot and `things`."""
     depth_m = raycast([*bodies(cell or small_cell(), [joints]), *things], OVERHEAD, CAMERA)
     if noise is not None:
         noisy = noise.normal(0.0, 0.004, depth_m.shape)
@@ -63,17 +63,17 @@ def look(
     return measured(depth_m, CAMERA)
 
 
-# ---------------------------------------------------------------- what is known and what is not
+# ---------------------------------------------------------------- known and unknown surfaces
 
 
-def test_what_is_known_is_no_obstacle() -> None:
+def test_a_known_surface_is_no_obstacle() -> None:
     rng = np.random.default_rng(0)
     watched = pipeline()
     for joints in np.linspace(-3.0, 3.0, 12):
         assert len(watched.process(look(joints=joints, noise=rng), [joints]).voxels) == 0
 
 
-def test_what_is_not_known_is_reported_where_it_stands() -> None:
+def test_an_unknown_object_is_reported_at_its_position() -> None:
     watched = pipeline()
     depth = look(PERSON)
     voxels = watched.process(depth, [0.3]).voxels
@@ -84,7 +84,7 @@ def test_what_is_not_known_is_reported_where_it_stands() -> None:
     assert 0.75 < centres_m[:, 2].max() < 0.85
 
 
-def test_foreground_is_what_process_counts() -> None:
+def test_foreground_agrees_with_process() -> None:
     watched = pipeline(occupancy_threshold=0.05, own_share_min=0.0, support_area_max_m2=1e-4)
     depth = look(PERSON)
     mask = watched.foreground(depth, [0.3])
@@ -118,7 +118,7 @@ def test_a_range_beyond_16_bits_ignores_everything() -> None:
 
 
 def test_known_edges_have_a_halo_and_no_more() -> None:
-    """Stereo matching makes known things look 30 mm wider; 150 mm beside them somebody left other ones."""
+    """Stereo matching makes known objects look 30 mm wider; 150 mm beside them there are unknown ones."""
     cell = small_cell(robot=False)
     watched = pipeline(cell)
     empty_m = raycast(bodies(cell, None), OVERHEAD, CAMERA)
@@ -135,7 +135,7 @@ def test_known_edges_have_a_halo_and_no_more() -> None:
 # ---------------------------------------------------------------- the robot
 
 
-def test_the_robot_is_filtered_wherever_it_is_and_reported_elsewhere() -> None:
+def test_the_robot_is_filtered_at_its_joints_and_reported_elsewhere() -> None:
     watched = pipeline()
     alone_m = raycast(bodies(small_cell(floor=False), [0.3])[1:], OVERHEAD, CAMERA)
     arm = shrunk(np.isfinite(alone_m) & (measured(alone_m, CAMERA) == look()), 3)
@@ -186,7 +186,7 @@ def test_a_hand_before_the_robot_is_seen() -> None:
 
 
 def test_joint_uncertainty_widens_the_robot() -> None:
-    """By what the links can move, and evenly; zero, a scalar and an array say the same."""
+    """By the possible motion of the links, and evenly; zero, a scalar and an array give the same."""
     watched = pipeline(small_cell(floor=False))
     everything = np.full(CAMERA.shape, 1350, np.uint16)
 
@@ -197,12 +197,12 @@ def test_joint_uncertainty_widens_the_robot() -> None:
     assert 50 < sure < unsure < very
     assert robot_px([0.1]) == robot_px(0.1) == unsure
     assert robot_px(np.zeros(1)) == sure
-    # What is expected is not padded.
+    # The expected depth is not padded.
     known = watched.expected_depth([0.3], joint_uncertainty_rad=0.3)
     assert (known == watched.expected_depth([0.3])).all()
 
 
-def test_an_arm_that_is_not_where_it_should_be_is_covered_by_its_uncertainty() -> None:
+def test_a_misplaced_arm_is_covered_by_its_uncertainty() -> None:
     watched = pipeline()
     off_rad = 0.25
     depth = look(joints=0.3 + off_rad)
@@ -239,7 +239,7 @@ def test_a_robot_without_meshes_filters_nothing() -> None:
     assert np.isinf(watched.expected_depth([0.3])).all()
 
 
-# ---------------------------------------------------------------- what may change while it runs
+# ---------------------------------------------------------------- changes at run time
 
 
 def test_the_voxel_size_changes_while_it_runs() -> None:
@@ -258,7 +258,7 @@ def test_the_voxel_size_changes_while_it_runs() -> None:
 
 
 def test_voxels_are_cropped_to_the_box() -> None:
-    """He stands astride the box's border."""
+    """The person stands astride the box's border."""
     cell = small_cell(robot=False)
     cropped = replace(cell, box_min_m=np.array((-0.3, -1.0, 0.1)), box_max_m=np.array((1.0, 0.4, 1.0)))
     watched = DepthPipeline(CAMERA, OVERHEAD, cropped)
@@ -346,7 +346,7 @@ def test_an_object_that_moves_leaves_the_robot_as_it_is(monkeypatch: pytest.Monk
 
 
 def test_cell_and_settings_are_adopted_together_or_not_at_all() -> None:
-    # Too large for the settings before, so that one after the other would not do.
+    # Too large for the earlier settings, so that two changes in sequence would fail.
     hall = replace(small_cell(), box_min_m=np.full(3, -15.0), box_max_m=np.full(3, 15.0))
     watched = pipeline()
     cell, before = watched.cell, watched.process(look(PERSON), [0.3]).voxels
@@ -364,7 +364,7 @@ def test_cell_and_settings_are_adopted_together_or_not_at_all() -> None:
 
 
 def test_another_pose_of_the_camera() -> None:
-    """After a move everything is as if the pipeline had been made there."""
+    """After a move the result equals that of a pipeline made at the new pose."""
     there = look_at((-0.5, -0.6, 1.6), (0.0, 0.0, 0.1))
     depth = measured(raycast([*bodies(small_cell(), [0.3]), PERSON], there, CAMERA), CAMERA)
     moved = pipeline()
@@ -379,7 +379,7 @@ def test_another_pose_of_the_camera() -> None:
 
 
 def test_another_cell() -> None:
-    """Another robot, other CAD: everything is as if the pipeline had been made for it."""
+    """Another robot, other CAD: the result equals that of a pipeline made for them."""
     cell = replace(small_cell(), robot=None, objects=(), name="other")
     changed = pipeline()
     changed.process(look(), [0.3])
@@ -393,8 +393,8 @@ def test_another_cell() -> None:
 
 
 @pytest.mark.parametrize("change", ["next frame", "source", "apply", "move", "use_cell", "use"])
-def test_a_result_stays_what_it_was(change: str) -> None:
-    """Neither later frames nor changes, nor a source that reuses its memory, reach into it."""
+def test_a_result_does_not_change_later(change: str) -> None:
+    """Later frames, changes, and a source that reuses its memory do not change it."""
     watched, depth = pipeline(), look(PERSON)
     result = watched.process(depth, [0.3], with_misfit=True)
     assert result.misfit is not None
@@ -416,8 +416,8 @@ def test_a_result_stays_what_it_was(change: str) -> None:
         assert (value == old).all()
 
 
-def test_what_the_robot_hides_is_not_seen() -> None:
-    """Neither behind it nor within its padding; without joints it is an obstacle and hides as such."""
+def test_blocks_that_the_robot_hides_are_not_seen() -> None:
+    """Neither behind the robot nor within its padding; without joints it is an obstacle and hides as such."""
     watched = pipeline()
     seen = watched.process(look(), [0.3]).seen
     keys = np.nonzero(seen.seen)[0]
@@ -428,7 +428,7 @@ def test_what_the_robot_hides_is_not_seen() -> None:
     assert watched.process(look(), None).seen.seen.sum() > 100
 
 
-def test_what_a_halo_may_hide_is_not_seen() -> None:
+def test_blocks_that_a_halo_may_hide_are_not_seen() -> None:
     """Beside the crate, at its own depth, nothing would be reported."""
     haloed, plain = pipeline(), pipeline(static_padding_m=0.0)
     with_halo, without = (watched.process(look(), [0.3]).seen.seen for watched in (haloed, plain))
@@ -436,7 +436,7 @@ def test_what_a_halo_may_hide_is_not_seen() -> None:
     assert with_halo.sum() < without.sum()
 
 
-def test_a_frame_tells_how_long_each_stage_took() -> None:
+def test_a_frame_reports_the_time_of_each_stage() -> None:
     watched = pipeline()
     times = watched.process(look(), [0.3]).times
     parts = (times.expected_ns, times.foreground_ns, times.density_ns, times.seen_ns, times.health_ns)
@@ -446,7 +446,7 @@ def test_a_frame_tells_how_long_each_stage_took() -> None:
     assert watched.process(look(), [0.3], with_misfit=True).times.misfit_ns > 0
 
 
-def test_misfit_is_told_where_it_is_asked_for() -> None:
+def test_misfit_is_computed_on_request() -> None:
     assert pipeline().process(look(), [0.3]).misfit is None
 
 
@@ -592,7 +592,7 @@ def test_a_pipeline_of_other_things_is_one_clear_error(name: str, value: Any, me
 @pytest.mark.parametrize(
     ("call", "value", "message"),
     [
-        ("use", "x", "reference: expected Reference, got str"),
+        ("use", "x", "reference: expected BackgroundModel, got str"),
         ("learn", [1], "frames: expected pairs of depth and joints, got int"),
         ("learn", [(GOOD,)], "frames: expected pairs of depth and joints, got 1 values"),
         ("learn", None, "frames: expected Iterable, got NoneType"),
@@ -655,7 +655,7 @@ def test_memory_is_flat_over_10_000_frames() -> None:
 
 
 def test_a_frame_allocates_nothing_that_grows_with_it() -> None:
-    """A 1280 x 720 frame has 1.8 MB; what `process` takes is a few poses and the voxels themselves."""
+    """A 1280 x 720 frame has 1.8 MB; `process` allocates a few poses and the voxels themselves."""
     intrinsics = camera(1280, 720)
     watched, depth = DepthPipeline(intrinsics, ABOVE_TABLE, demo_cell()), demo_frame(intrinsics)
     process_moving(watched, depth, 0, 5)
@@ -671,7 +671,7 @@ def test_a_frame_allocates_nothing_that_grows_with_it() -> None:
 
 
 def test_the_marks_on_real_frames(data_dir: Path) -> None:
-    """A RealSense before an xArm7 and, in frames 0 to 3, a second robot that is in no model; default settings."""
+    """A RealSense before an xArm7 and, in frames 0 to 3, a second robot without a model; default settings."""
     folder = data_dir / "xarm7_realsense"
     cell = Cell.load(CHECKOUT / "assets" / "cells" / "xarm7" / "cell.yaml")
     intrinsics = Intrinsics(1280, 720, 908.3020, 908.2927, 642.962, 372.7315, fx_stereo=430.0)
@@ -703,7 +703,7 @@ def test_the_marks_on_real_frames(data_dir: Path) -> None:
         assert false == 0
 
 
-def test_scenes_are_what_the_tests_take_them_for() -> None:
+def test_scenes_meet_the_assumptions_of_the_tests() -> None:
     """The person stands clear of the robot and of the crate, in full view."""
     empty, occupied = look(), look(PERSON)
     assert (occupied < empty).sum() > 300

@@ -44,7 +44,7 @@ def test_the_halo_of_a_known_edge_is_not_reported() -> None:
     assert not pipeline().foreground(grown, None).any()
 
 
-def test_what_stands_beside_an_edge_deeper_or_nearer_is_seen() -> None:
+def test_an_object_beside_an_edge_deeper_or_nearer_is_seen() -> None:
     for depth_mm in (800, 1150, 1400):
         depth = scene()
         beside = np.zeros(CAMERA.shape, bool)
@@ -55,7 +55,7 @@ def test_what_stands_beside_an_edge_deeper_or_nearer_is_seen() -> None:
         assert len(watched.process(depth, None).voxels) > 0
 
 
-def test_what_a_halo_could_hide_is_not_called_seen() -> None:
+def test_depths_that_a_halo_could_hide_are_not_called_seen() -> None:
     """Blocks beside the block's top, at its depth, are unseen, those above its edge are not, nor any without halo."""
     heights = (-0.65, -1.05)
     seen = []

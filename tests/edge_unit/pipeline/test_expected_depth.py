@@ -41,7 +41,7 @@ VIEWS: list[tuple[Transform, ArrayLike]] = [
 
 
 @pytest.mark.parametrize("view", range(len(VIEWS)))
-def test_expected_depth_is_what_rays_hit(view: int) -> None:
+def test_expected_depth_agrees_with_ray_casting(view: int) -> None:
     """UR3e, gripper, table, shelf, tray and floor at 1280 x 720."""
     T_world_camera, joints = VIEWS[view]
     intrinsics, cell = camera(1280, 720), demo_cell()
@@ -77,7 +77,7 @@ def test_the_robots_silhouette_is_that_of_rays(view: int) -> None:
 
 
 def test_a_link_that_the_near_plane_cuts_does_not_vanish() -> None:
-    """The arm passes right before the lens: one end lies behind the camera, the other fills the picture's middle."""
+    """The arm passes right before the lens: one end lies behind the camera, the other fills the image's middle."""
     intrinsics = camera(424, 240)
     bar = box_mesh("bar", (1.0, 0.05, 0.05))
     T_world_camera = look_at((0.0, 0.09, 0.0), (0.4, -0.05, 0.0))
@@ -101,7 +101,7 @@ def test_a_batch_without_meshes_draws_nothing() -> None:
 
 
 def test_meshes_of_a_batch_keep_to_themselves() -> None:
-    """Each alone gives the picture that all together give."""
+    """The meshes one by one give the same image as all together."""
     intrinsics = camera(160, 90)
     meshes = [sphere_mesh("ball", 0.2), box_mesh("box", (0.2, 0.3, 0.1)), sphere_mesh("small", 0.05)]
     poses = [from_xyz_rpy((x, 0.1 * x, 1.5 + x), (x, 0.2, 0.0)) for x in (-0.5, 0.1, 0.4)]
@@ -132,7 +132,7 @@ def test_the_static_layer_is_drawn_anew_each_time() -> None:
     assert not again.nearest_w.any()
 
 
-def test_what_stands_where_it_stood_is_not_drawn_again() -> None:
+def test_bodies_that_did_not_move_are_not_drawn_again() -> None:
     ball, other = sphere_mesh("ball", 0.2), box_mesh("other", (0.2, 0.2, 0.2))
     layer = StaticLayer(camera(160, 90), [placed("ball", ball, (0, 0, 1))])
     layer.draw(np.eye(4))
@@ -146,7 +146,7 @@ def test_what_stands_where_it_stood_is_not_drawn_again() -> None:
     assert not layer.of([]).nearest_w.any()
 
 
-def test_the_bare_robot_forgets_where_it_was() -> None:
+def test_the_bare_robot_keeps_no_old_pose() -> None:
     robot, intrinsics = small_robot(), camera(160, 90)
     layer = BareRobot(intrinsics, robot)
 
@@ -212,7 +212,7 @@ def test_the_band_is_that_of_rays_on_the_inflated_hulls() -> None:
 
 
 def test_from_within_the_padding_all_is_robot_up_to_the_links_back() -> None:
-    """The arm points away from the camera, which it begins 30 mm before."""
+    """The arm points away from the camera, and starts 30 mm before it."""
     arm = Arm()
     poses = np.stack((np.eye(4), from_xyz_rpy((0.0, 0.0, 0.03), (0.0, -np.pi / 2, 0.0))))
     padding_m = np.full(2, PADDING_M, np.float32)
@@ -223,7 +223,7 @@ def test_from_within_the_padding_all_is_robot_up_to_the_links_back() -> None:
 
 
 def test_from_outside_the_padding_no_pixel_has_a_back_without_a_front() -> None:
-    """At silhouettes triangles turned here and turned away cover the same pixels."""
+    """At silhouettes triangles that face the camera and triangles that face away cover the same pixels."""
     arm = Arm()
     for angle in np.linspace(0.0, 2.0 * np.pi, 100):
         assert arm.draw(float(angle))
@@ -274,8 +274,8 @@ def test_after_any_way_the_band_is_that_of_a_fresh_layer() -> None:
     assert (arm.layer.columns == fresh.layer.columns).all()
 
 
-def test_links_that_stand_still_are_kept_and_all_is_as_if_drawn_anew() -> None:
-    """An arm that turns, rests, trembles and goes on, one link of which is lost and found again."""
+def test_links_that_did_not_move_are_kept_and_the_image_equals_a_new_one() -> None:
+    """An arm that turns, rests, trembles and moves again; one of its links is lost and found again."""
     arm = Arm()
     rng = np.random.default_rng(1)
     angle = 0.0
@@ -297,7 +297,7 @@ def test_trembling_joints_are_not_drawn_again() -> None:
     assert not any(arm.draw(0.4 + angle) for angle in rng.uniform(-2e-4, 2e-4, 100))
 
 
-def test_a_slow_drift_is_never_far_from_what_is_drawn() -> None:
+def test_a_slow_drift_never_moves_far_from_the_drawn_pose() -> None:
     """Steps of a twentieth of STILL_M at the tip: each is small, and all together are not."""
     arm, tip_m = Arm(), 0.4
     arm.draw(0.0)

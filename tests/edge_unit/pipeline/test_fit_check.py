@@ -19,7 +19,7 @@ def check(depth: Depth, static_m: NDArray[np.float32] = WALL_M, robot: NDArray[n
     return HealthCheck(CAMERA).check(depth, measured(static_m, CAMERA), robot, SETTINGS)
 
 
-def test_a_camera_that_sees_what_it_should() -> None:
+def test_a_camera_that_sees_the_expected_depth() -> None:
     rng = np.random.default_rng(0)
     health = check(measured(WALL_M + rng.normal(0.0, 0.005, CAMERA.shape), CAMERA))
     assert health.valid_share == 1.0
@@ -36,7 +36,7 @@ def test_a_covered_lens_is_invalid_or_disagrees() -> None:
 
 
 def test_a_camera_that_was_knocked_disagrees() -> None:
-    """A wall that stands askew of what is expected, 60 cm from end to end."""
+    """A wall at an angle to the expected one, 60 cm from end to end."""
     tilt = np.linspace(-0.3, 0.3, CAMERA.width, dtype=np.float32)
     assert check(measured(WALL_M + tilt, CAMERA)).agreeing_share < 0.8
 
@@ -51,7 +51,7 @@ def test_a_shift_shows_in_the_residual() -> None:
 
 
 def test_the_residual_is_the_median() -> None:
-    """Most of the picture is farther than expected, the rest nearer; outliers count for nothing."""
+    """Most of the image is farther than expected, the rest nearer; outliers do not count."""
     depth = np.full(CAMERA.shape, 1500, np.uint16)
     depth[:, :120] -= 20
     depth[:, 120:300] += 30

@@ -12,7 +12,7 @@ from tests.edge_unit.scenes import OVERHEAD, bodies, camera, measured, placed, r
 CAMERA = camera(160, 90)
 
 
-def test_what_is_expected_and_what_the_filter_leaves() -> None:
+def test_expected_depth_and_foreground() -> None:
     cell = small_cell()
     person = placed("person", cylinder_mesh("person", 0.1, 1.0), (-0.5, 0.3, 0.5))
     depth = measured(raycast([*bodies(cell, [0.3]), person], OVERHEAD, CAMERA), CAMERA)
@@ -26,11 +26,11 @@ def test_what_is_expected_and_what_the_filter_leaves() -> None:
     assert mask.sum() > 50
     assert (left[mask] == depth[mask]).all()
     assert not left[~mask].any()
-    # Being looked at changes nothing.
+    # An image request changes nothing.
     assert (watched.process(depth, [0.3]).voxels.keys == before).all()
 
 
-def test_a_raw_picture_comes_back_as_it_was() -> None:
+def test_a_raw_image_survives_the_round_trip() -> None:
     picture = np.arange(160 * 90, dtype=np.uint16).reshape(90, 160) * np.uint16(4)
     png = png_of(picture, 0.00025, raw=True)
     again = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -49,6 +49,6 @@ def test_colours_go_from_red_nearby_to_blue_far_away_on_one_scale() -> None:
     assert (red[1:3] > blue[1:3] + 50).all()
     assert (blue[3:] > red[3:]).all()
     assert (red[1], blue[1]) == (red[2], blue[2])
-    # What else is in the frame changes no colour.
+    # Other parts of the frame change no colour.
     alone = cv2.imdecode(np.frombuffer(png_of(picture[:, 2:3], 0.001, raw=False), np.uint8), cv2.IMREAD_UNCHANGED)
     assert alone[0, 0, 2] == red[2]

@@ -85,7 +85,7 @@ def test_the_kernels_equal_their_slow_twins(kind: str, stride: int) -> None:
 
 
 def seen_from(X: Transform) -> Misfit:
-    """The small cell, looked at from `X` beside where the camera should be."""
+    """Return the misfit of the small cell, seen from `X` beside the camera's expected pose."""
     cell = small_cell(robot=False)
     eye = camera(424, 240)
     pipeline = DepthPipeline(eye, OVERHEAD, cell)
@@ -95,7 +95,7 @@ def seen_from(X: Transform) -> Misfit:
     return misfit
 
 
-def test_the_slope_points_to_where_the_camera_is() -> None:
+def test_the_slope_points_to_the_true_pose() -> None:
     straight = seen_from(np.eye(4))
     assert (straight.curvature[:3] > 0.0).all()
     assert straight.beyond_share < 1e-3
@@ -107,7 +107,7 @@ def test_the_slope_points_to_where_the_camera_is() -> None:
             assert np.sign(there.slope[axis] - straight.slope[axis]) == -sign
 
 
-def test_what_is_before_the_known_surfaces_tells_nothing_and_what_is_behind_is_told() -> None:
+def test_depth_before_the_known_surfaces_does_not_count_and_depth_behind_does() -> None:
     check = MisfitCheck(CAMERA)
     wall = np.full(CAMERA.shape, 2000, np.uint16)
     box = wall.copy()

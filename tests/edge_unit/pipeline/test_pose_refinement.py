@@ -104,7 +104,7 @@ def test_planes_have_the_normals_that_they_are_drawn_with_and_edges_have_none() 
 
 
 def frames_of(number: int, pipeline: DepthPipeline, count: int = 20) -> list[Depth]:
-    """What a camera of the demo rig measures, with people about."""
+    """Return frames of a camera of the demo rig, with people in view."""
     true = rig(demo_cell(), 4)[number]
     eye = SimulatedCamera(World.demo(people=2, seed=3, cell=demo_cell()), true, pipeline.intrinsics, seed=number)
     frames = [eye.capture(0.1 * n) for n in range(count)]
@@ -126,7 +126,7 @@ def test_a_pose_that_is_off_comes_nearer_to_the_truth(number: int) -> None:
     assert error_of(wrong, true) == pytest.approx((19.7, 1.5), abs=0.2)
 
 
-def test_a_right_pose_stays_what_it_is() -> None:
+def test_a_right_pose_stays_unchanged() -> None:
     true = rig(demo_cell(), 4)[3]
     pipeline = DepthPipeline(d435i_intrinsics(424, 240), true, demo_cell())
     found = pipeline.refiner().refine(frames_of(3, pipeline))
@@ -158,7 +158,7 @@ def test_without_known_surfaces_in_view_it_is_refused() -> None:
     assert "nothing to align with" in found.reason
 
 
-def test_what_is_no_image_of_this_camera_is_refused() -> None:
+def test_an_image_of_another_shape_or_type_is_refused() -> None:
     pipeline = DepthPipeline(EYE, OVERHEAD, small_cell(robot=False))
     with pytest.raises(InputError, match="at least one frame"):
         pipeline.refiner().refine([])

@@ -18,11 +18,11 @@ FAR = np.full(CAMERA.shape, 65535, np.uint16)
 
 
 def look(depth: NDArray[np.uint16], limit: NDArray[np.uint16] = FAR, robot: NDArray[np.uint16] = FAR) -> SeenBlocks:
-    return Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.9, 0.0).look(depth, limit, robot)
+    return Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.9, 0.0).find_seen(depth, limit, robot)
 
 
 def depth_of(blocks: SeenBlocks) -> NDArray[np.float64]:
-    """Along the camera's axis, of the middles of the seen blocks."""
+    """Distances of the seen blocks' middles along the camera's axis."""
     keys = np.nonzero(blocks.seen)[0]
     return apply(inverse(ABOVE), blocks.lattice.centres(blocks.lattice.indices(keys)))[:, 2]
 
@@ -46,7 +46,7 @@ def test_blocks_that_hold_part_of_a_voxel_can_be_taken_out(voxel_size_m: float, 
     voxels = Voxels(keys, np.ones(4, np.uint32), voxel)
     everything = SeenBlocks(np.ones(blocks.cell_count, np.uint8), blocks)
     left = everything.without(voxels)
-    # A block and a voxel overlap when they do on each axis; more than by rounding.
+    # A block and a voxel overlap if they overlap on each axis by more than rounding.
     low_m = np.array(voxel.origin_m) + voxels.indices * voxel_size_m + 1e-6
     high_m = low_m + voxel_size_m - 2e-6
     block_low_m = np.array(blocks.origin_m) + np.argwhere(np.ones(blocks.shape)) * blocks.voxel_size_m
@@ -55,7 +55,7 @@ def test_blocks_that_hold_part_of_a_voxel_can_be_taken_out(voxel_size_m: float, 
     assert everything.seen.all()
 
 
-def test_blocks_that_are_seen_lie_wholly_in_the_picture() -> None:
+def test_seen_blocks_lie_wholly_in_the_image() -> None:
     blocks = look(FAR)
     keys = np.nonzero(blocks.seen)[0]
     index = blocks.lattice.indices(keys)
@@ -67,7 +67,7 @@ def test_blocks_that_are_seen_lie_wholly_in_the_picture() -> None:
 
 
 @pytest.mark.parametrize("image", ["depth", "limit", "robot"])
-def test_nothing_is_seen_through_what_hides_it(image: str) -> None:
+def test_hidden_blocks_are_not_seen(image: str) -> None:
     images = {"depth": FAR, "limit": FAR, "robot": FAR}
     images[image] = np.zeros(CAMERA.shape, np.uint16)
     assert not look(**images).seen.any()
@@ -79,18 +79,18 @@ def test_nothing_is_seen_through_what_hides_it(image: str) -> None:
 
 def test_a_report_is_not_overwritten_by_the_next() -> None:
     visibility = Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.9, 0.0)
-    first = visibility.look(FAR, FAR, FAR)
+    first = visibility.find_seen(FAR, FAR, FAR)
     number = first.seen.sum()
-    visibility.look(np.zeros_like(FAR), FAR, FAR)
+    visibility.find_seen(np.zeros_like(FAR), FAR, FAR)
     assert first.seen.sum() == number > 0
 
 
-def test_a_camera_that_moved_looks_elsewhere() -> None:
+def test_a_moved_camera_sees_other_blocks() -> None:
     visibility = Visibility(CAMERA, ABOVE, *BOX_M, 0.1, 0.9, 0.0)
     visibility.place(look_at((0, 0, 1.7), (0, 0, 5.0)))
-    assert not visibility.look(FAR, FAR, FAR).seen.any()
+    assert not visibility.find_seen(FAR, FAR, FAR).seen.any()
     visibility.place(ABOVE)
-    assert (visibility.look(FAR, FAR, FAR).seen == look(FAR).seen).all()
+    assert (visibility.find_seen(FAR, FAR, FAR).seen == look(FAR).seen).all()
 
 
 def test_packed_bits_start_with_the_first_block_in_the_lowest_bit() -> None:
@@ -100,7 +100,7 @@ def test_packed_bits_start_with_the_first_block_in_the_lowest_bit() -> None:
 
 
 @pytest.mark.parametrize("shape", [(4, 4, 4), (5, 3, 7), (1, 1, 1), (2, 1, 9)])
-def test_a_coarser_block_is_seen_where_all_its_parts_are(shape: tuple[int, int, int]) -> None:
+def test_a_coarser_block_is_seen_if_all_its_parts_are(shape: tuple[int, int, int]) -> None:
     rng = np.random.default_rng(0)
     fine = SeenBlocks((rng.random(int(np.prod(shape))) < 0.9).astype(np.uint8), Lattice((-1, 2, 0), 0.1, shape))
     coarse = fine.coarser()

@@ -23,7 +23,7 @@ KEEP_ALL = FilterSettings(occupancy_threshold=0.05, own_share_min=0.0, support_a
 
 
 def run(voxelizer: Voxelizer, depth: Depth, mask: NDArray[np.bool_]) -> Voxels:
-    """Nothing stands before the camera: all that is marked is foreground."""
+    """Nothing is before the camera: all marked pixels are foreground."""
     intrinsics = camera(depth.shape[1], depth.shape[0])
     room = np.where(mask, np.uint16(65535), np.uint16(0))
     nobody = RobotLayer(intrinsics, None, 0.05)
@@ -89,7 +89,7 @@ def test_one_frame_leaves_nothing_for_the_next() -> None:
     assert (again.counts == first.counts).all()
 
 
-def test_what_was_returned_is_not_overwritten() -> None:
+def test_a_returned_result_is_not_overwritten() -> None:
     intrinsics = camera(160, 90)
     lattice = Lattice.covering((-1, -1, -0.2), (1, 1, 1.8), 0.05)
     voxelizer = Voxelizer(intrinsics, look_at((0.3, 0.2, 1.7), (0, 0, 0)), lattice, FilterSettings())
@@ -101,7 +101,7 @@ def test_what_was_returned_is_not_overwritten() -> None:
     assert (first.counts == number).all()
 
 
-def test_a_camera_that_moved_sees_the_same_things_where_they_are() -> None:
+def test_a_moved_camera_reports_the_same_objects_at_the_same_positions() -> None:
     intrinsics = camera(160, 90)
     lattice = Lattice.covering((-1, -1, -0.2), (1, 1, 1.8), 0.05)
     voxelizer = Voxelizer(intrinsics, np.eye(4), lattice, FilterSettings())
@@ -116,7 +116,7 @@ def test_a_camera_that_moved_sees_the_same_things_where_they_are() -> None:
     assert (other.keys == voxels.keys).all()
 
 
-# ---------------------------------------------------------------- how dense is dense enough
+# ---------------------------------------------------------------- the density rule
 
 
 def plate(intrinsics: Intrinsics, z_m: float, side_m: float, shift_m: tuple[float, float] = (0, 0)) -> Depth:
@@ -142,7 +142,7 @@ def test_a_plate_of_10_cm_is_never_lost_at_the_defaults(z_m: float) -> None:
         assert len(found(FilterSettings(), depth, intrinsics)) > 0
 
 
-def test_the_papers_own_rule_loses_what_lies_on_a_border() -> None:
+def test_the_papers_own_rule_loses_an_object_on_a_border() -> None:
     intrinsics = camera(848, 480)
     paper = FilterSettings(density_rule="single", density_model="angular", occupancy_threshold=0.6)
     depth = plate(intrinsics, 1.475, 0.05, (0.025, 0.025))  # a full voxel's face, shifted by half of it on two axes
@@ -163,8 +163,8 @@ def test_speckle_is_noise_and_a_hand_is_not(rule: str, model: str) -> None:
     assert len(found(settings, plate(intrinsics, 1.5, 0.2), intrinsics)) > 0
 
 
-def test_the_angular_model_asks_for_more_than_the_pinhole() -> None:
-    """In the middle of the picture it expects some 30 % more points than there are."""
+def test_the_angular_model_needs_more_points_than_the_pinhole() -> None:
+    """In the middle of the image it expects some 30 % more points than there are."""
     intrinsics = camera(848, 480)
     depth = plate(intrinsics, 1.475, 0.05, (0.025, 0.025))
     for model, number in (("pinhole", 1), ("angular", 0)):

@@ -100,7 +100,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
         "binning_x, binning_y: expected images of 4 x 3",
     ),
     "region, size edited": ({**PLAIN, "roi": {"x_offset": 4, "y_offset": 3, "width": 8, "height": 6}}, "roi: "),
-    "no YAML": ("a: [", "no YAML"),
+    "no YAML": ("a: [", "expected YAML"),
 }
 
 

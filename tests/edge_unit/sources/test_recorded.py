@@ -64,7 +64,7 @@ async def test_frames_come_in_order_with_their_joints(folder: Path) -> None:
         assert frame.joints.tolist() == [number, -number]
 
 
-async def test_frames_in_the_order_asked_for(folder: Path) -> None:
+async def test_frames_in_the_configured_order(folder: Path) -> None:
     frames = await play(folder, frames=[10, "3", "3.png", 0])
     assert [int(frame.depth[0, 0]) for frame in frames] == [10, 3, 3, 0]
     assert [frame.joints.tolist()[0] for frame in frames if frame.joints is not None] == [10, 3, 3, 0]
@@ -162,7 +162,7 @@ def break_it(folder: Path, how: str) -> None:
         ("no folder", "set: expected the folder of a recording"),
         ("no images", "depth: expected depth images"),
         ("no info", "camera_info.yaml: cannot be read"),
-        ("info is text", "camera_info.yaml: no YAML"),
+        ("info is text", "camera_info.yaml: expected YAML"),
         ("info lacks", "camera_info.yaml: k: "),
         ("distorted", "camera_info.yaml: d: expected images without distortion"),
         ("focal length", "camera_info.yaml: k: "),
@@ -170,13 +170,13 @@ def break_it(folder: Path, how: str) -> None:
         ("joints count", "joint_states_rad.csv: expected 12 rows, one for each depth image, got 1"),
         ("joints nan", "joint_states_rad.csv: expected a row of joint positions for each frame: expected finite"),
         ("joints text", "joint_states_rad.csv: expected a row of joint positions for each frame: line 2: "),
-        ("no png", "0.png: no image that can be read"),
-        ("empty png", "0.png: no image that can be read"),
+        ("no png", "0.png: expected an image, got another file"),
+        ("empty png", "0.png: expected an image, got another file"),
         ("8 bits", "0.png: depth: expected dtype uint16"),
         ("other size", "camera_info.yaml: width, height: expected those of the images, 5 x 3, got 4 x 3"),
     ],
 )
-async def test_what_is_wrong_is_named_with_its_file(folder: Path, how: str, words: str) -> None:
+async def test_an_error_names_the_file(folder: Path, how: str, words: str) -> None:
     break_it(folder, how)
     with pytest.raises(SourceError) as caught:
         await play(folder)
@@ -206,7 +206,7 @@ async def test_a_frame_that_is_not_there_is_named(folder: Path) -> None:
 
 
 async def test_frames_before_opening_are_an_error(folder: Path) -> None:
-    with pytest.raises(SourceError, match="before it was opened"):
+    with pytest.raises(SourceError, match="expected an open source"):
         async for _ in source(folder).frames():
             pass
 

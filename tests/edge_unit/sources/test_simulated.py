@@ -199,7 +199,7 @@ async def test_a_camera_that_is_knocked_covered_and_exchanged(cell: Cell, tmp_pa
         knocked = (await asyncio.wait_for(take(source, 1), WAIT_S))[0]
         await asyncio.to_thread(Handling(covered=True).write, handling)
         covered = (await asyncio.wait_for(take(source, 1), WAIT_S))[0]
-        async with source.look("infrared") as look, aclosing(look.images()) as images:
+        async with source.open_images("infrared") as feed, aclosing(feed.images()) as images:
             assert not (await anext(images)).pixels.any()
         await asyncio.to_thread(LEFT_ALONE.write, handling)
         back = (await asyncio.wait_for(take(source, 1), WAIT_S))[0]

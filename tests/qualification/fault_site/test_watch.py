@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""That the judge of the fault table condemns what is wrong, and nothing else."""
+"""The judge of the fault table condemns every wrong answer, and nothing else."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ COURSE = (
 )
 
 
-def test_a_fault_that_is_noticed_and_gone_is_told_with_its_times() -> None:
+def test_a_fault_is_listed_with_its_times() -> None:
     found = verdict(*COURSE)
     assert found.noticed_s == pytest.approx(0.6)
     assert found.recovered_s == pytest.approx(0.3)
@@ -54,11 +54,11 @@ def test_a_fault_that_is_noticed_and_gone_is_told_with_its_times() -> None:
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (at(11.0, GOOD), "free although there is the newcomer"),
-        (at(11.0, replace(STALE, free=HERE)), "free although there is the resident of camera 1"),
+        (at(11.0, GOOD), "free although it holds the newcomer"),
+        (at(11.0, replace(STALE, free=HERE)), "free although it holds the resident of camera 1"),
         (at(11.0, replace(BACK, held=HERE)), "complete without the newcomer"),
         (at(11.0, replace(BACK, units_live=1)), "complete with 1 of 2 units"),
-        (at(11.0, BACK), "complete while nobody could know"),
+        (at(11.0, BACK), "complete although the fault hid the state"),
         (at(13.5, replace(BACK, held=frozenset(), free=frozenset())), "complete without the newcomer"),
     ],
 )
@@ -71,7 +71,7 @@ def test_a_reason_that_names_another_unit_notices_nothing() -> None:
     assert verdict(at(10.6, other), at(13.1, BACK)).noticed_s is None
 
 
-def test_no_answer_tells_of_a_dead_master_and_is_no_claim() -> None:
+def test_a_missing_answer_reveals_a_dead_master_and_claims_nothing() -> None:
     silence: Any = Answer(round(10.1 * NS_PER_S))
     found = verdict(silence, at(13.2, BACK), names="")
     assert found.noticed_s == pytest.approx(0.1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A camera that is no recording, as the SDK's software device: what `SdkStream` and `Devices` do with it, as JSON.
+"""A live camera as the SDK's software device: the results of `SdkStream` and `Devices` with it, as JSON.
 
 For a process of its own, so that the SDK is loaded nowhere else.
 """
@@ -81,7 +81,7 @@ class Camera:
 def streams() -> dict[str, Any]:
     """Profiles, options and times of a live stream."""
     camera = Camera()
-    # As a look at the board leaves it that did not come to its end.
+    # The state after an interrupted delivery of images of the board.
     camera.sensor.set_option(rs.option.emitter_enabled, 0.0)
     before = camera.options()
     stream = SdkStream(camera.device, Request(width=848, height=480, fps=15, latency_ns=20 * NS_PER_MS))
@@ -123,7 +123,7 @@ def streams() -> dict[str, Any]:
 
 
 def busy() -> dict[str, Any]:
-    """Errors of a camera that somebody else has."""
+    """Check the errors of a camera that another program uses."""
 
     class Taken:
         def __init__(self, camera: Camera, text: str) -> None:
@@ -145,7 +145,7 @@ def busy() -> dict[str, Any]:
 
 
 def resets() -> dict[str, Any]:
-    """A camera that goes when it is reset, and comes back, or does not."""
+    """Check a camera that disappears on a reset, and returns or does not."""
 
     class Context:
         def __init__(self) -> None:

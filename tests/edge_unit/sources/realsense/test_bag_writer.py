@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of images, recorded and played through the SDK, is the same frames."""
+"""A folder of images, recorded and played through the SDK, gives the same frames."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ FPS = 60.0
 
 @pytest.fixture(scope="module", autouse=True)
 def sdk(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Skips where the SDK cannot be imported."""
+    """Skip if the SDK cannot be imported."""
     recordings.write(tmp_path_factory.mktemp("probe") / "probe.db3", 1)
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Nine noisy images with every value that sixteen bits can have at their borders."""
+    """Nine noisy images with all border values of sixteen bits."""
     random = np.random.default_rng(3)
     (tmp_path / "depth").mkdir()
     for number in range(9):
@@ -42,7 +42,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 async def check_same(images: RecordedSourceConfig, recording: Path) -> int:
-    """Every frame, its joints and the camera are the same from both; returns how many frames there were."""
+    """Check that every frame, its joints and the camera are equal in both; returns the number of frames."""
     first = RecordedSource(images)
     second = RealsenseSource(await asyncio.to_thread(played, images, recording))
     count = 0
@@ -109,6 +109,6 @@ def test_errors_name_the_file(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"nothing: expected the folder of a recording"):
         record_images(RecordedSourceConfig(folder=tmp_path / "nothing"), tmp_path / "out.db3", FPS)
     (folder / "depth" / "04.png").write_bytes(b"no image")
-    with pytest.raises(SourceError, match=r"04\.png: no image that can be read"):
+    with pytest.raises(SourceError, match=r"04\.png: expected an image, got another file"):
         record_images(images, tmp_path / "out.db3", FPS)
     assert not (tmp_path / "out.db3").exists()

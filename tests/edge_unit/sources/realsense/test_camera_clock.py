@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera's clock against simulated ones that drift, jump, wrap and lie."""
+"""The camera's clock against simulated ones that drift, jump, wrap and give wrong readings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LATENCY_NS = 12 * NS_PER_MS
 
 @dataclass
 class SimulatedCamera:
-    """A clock with an offset and a drift, frames under way for a while, and a clock that can be asked."""
+    """A clock with an offset and a drift, frames with a travel time, and a readable clock."""
 
     drift_ppm: float = 0.0
     zero_ns: int = 1000 * NS_PER_S
@@ -32,20 +32,20 @@ class SimulatedCamera:
         return camera_ns % WRAP_NS if self.wraps else camera_ns
 
     def frames(self, from_ns: int, seconds: float) -> Iterator[tuple[int, int, int]]:
-        """True time of capture, its stamp, and when it arrived: mostly soon, sometimes late."""
+        """Return a frame's true capture time, its stamp, and its arrival: mostly soon, sometimes late."""
         for k in range(round(seconds * NS_PER_S / PERIOD_NS)):
             taken_ns = from_ns + k * PERIOD_NS
             under_way_ns = LATENCY_NS + round(self.random.exponential(4.0) * NS_PER_MS)
             yield taken_ns, self.stamp(taken_ns), taken_ns + under_way_ns
 
     def reading(self, our_ns: int, error_ns: int = 0) -> tuple[int, int, int]:
-        """Asked, told, answered: the answer takes 1 to 4 ms, and the reading is made somewhere in between."""
+        """Return times before, of and after a reading: the answer takes 1 to 4 ms, and the reading lies in between."""
         there_ns, back_ns = (round(self.random.uniform(0.5, 2.0) * NS_PER_MS) for _ in range(2))
         return our_ns, self.stamp(our_ns + there_ns) + error_ns, our_ns + there_ns + back_ns
 
 
 def errors_ms(clock: CameraClock, camera: SimulatedCamera, from_ns: int, seconds: float, ask: bool) -> list[float]:
-    """How far each frame's time was off."""
+    """Return the error of each frame's time."""
     errors, asked_ns = [], 0
     for taken_ns, stamp_ns, arrived_ns in camera.frames(from_ns, seconds):
         if ask and arrived_ns - asked_ns > NS_PER_S:
@@ -73,7 +73,7 @@ def test_without_it_the_fastest_frame_and_the_assumed_latency_decide(drift_ppm: 
     clock, camera = CameraClock(LATENCY_NS), SimulatedCamera(drift_ppm)
     errors = errors_ms(clock, camera, START_NS, 600.0, ask=False)
     assert not clock.measured
-    # A frame or two may have to come before a fast one does.
+    # One or two frames may come before a fast one.
     assert max(map(abs, errors[150:])) < 1.5
     assert max(errors) < 30.0
 

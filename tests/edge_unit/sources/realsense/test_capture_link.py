@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The link to a capture process, and the process in our hands."""
+"""The link to a capture process, and the handle of the process."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_an_open_file_comes_along(ends: tuple[socket.socket, socket.socket]) -> 
     os.close(read_end)
 
 
-def test_what_may_be_lost_is_lost_when_nobody_listens_and_packets_keep_their_borders(
+def test_optional_messages_are_dropped_without_a_reader_and_packets_keep_their_borders(
     ends: tuple[socket.socket, socket.socket],
 ) -> None:
     sent = 0
@@ -90,15 +90,15 @@ async def test_a_process_that_cannot_be_started_is_an_error() -> None:
 @pytest.mark.parametrize(
     ("script", "how"), [("raise SystemExit(3)", "exit status 3"), ("import os; os.kill(os.getpid(), 11)", "SIGSEGV")]
 )
-async def test_how_a_process_ended_is_told(script: str, how: str) -> None:
+async def test_the_end_of_a_process_is_described(script: str, how: str) -> None:
     session = await CaptureSession.begin(link.Survey(), (sys.executable, "-c", script))
     for _ in range(100):
         await session.wait(0.1)
         if session.gone:
             break
     assert how in await session.ended()
-    # There is nobody to hear it, and that is no error.
-    session.tell(link.Stop())
+    # There is no receiver, and that is not an error.
+    session.send(link.Stop())
 
 
 async def test_a_process_that_does_not_stop_is_killed() -> None:

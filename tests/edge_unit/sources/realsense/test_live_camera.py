@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is done with a camera that is no recording, on the SDK's software device (see `live_camera`)."""
+"""The handling of a live camera, on the SDK's software device (see `live_camera`)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.edge_unit.sources.realsense import recordings
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """What the process found out; skips where the SDK cannot be imported."""
+    """Return the results of the process; skips if the SDK cannot be imported."""
     recordings.write(tmp_path_factory.mktemp("probe") / "probe.db3", 1)
     command = (sys.executable, "-m", "tests.edge_unit.sources.realsense.live_camera")
     ended = subprocess.run(command, capture_output=True, text=True)
@@ -23,7 +23,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return json.loads(ended.stdout)
 
 
-def test_the_profile_falls_back_to_what_the_port_carries(told: Any) -> None:
+def test_the_profile_falls_back_to_the_ports_limit(told: Any) -> None:
     streams = told["streams"]
     assert streams["profile"] == [640, 480, 15]
     assert streams["warning"] == (
@@ -34,7 +34,7 @@ def test_the_profile_falls_back_to_what_the_port_carries(told: Any) -> None:
     assert streams["color"] == "camera LIVE1 offers no color stream (rgb8)"
 
 
-def test_the_emitter_is_off_only_for_a_look_at_the_board(told: Any) -> None:
+def test_the_emitter_is_off_only_for_images_of_the_board(told: Any) -> None:
     emitter, global_time = zip(
         *(told["streams"][when] for when in ("before", "depth_options", "infrared_options", "options_afterwards")),
         strict=True,
@@ -48,13 +48,13 @@ def test_the_emitter_is_off_only_for_a_look_at_the_board(told: Any) -> None:
 def test_no_frame_is_read_twice_and_its_time_is_that_of_the_exposure(told: Any) -> None:
     readings = told["streams"]["readings"]
     assert [(number, pixel) for number, pixel, _ in readings] == [(1, 1), (2, 2), (5, 5)]
-    # 20 ms from read-out to arrival are assumed, and 4 ms from exposure to read-out are told.
+    # The assumed time from read-out to arrival is 20 ms; the reported one from exposure to read-out is 4 ms.
     for _, _, age_ms in readings:
         assert 18.0 < age_ms <= 24.0
     assert told["streams"]["silent"]
 
 
-def test_a_camera_in_other_hands_is_told_from_one_that_fails(told: Any) -> None:
+def test_a_camera_in_use_is_distinguished_from_one_that_fails(told: Any) -> None:
     busy, other = told["busy"].values()
     assert "camera LIVE1 is in use by another program" in busy
     assert "stop that one" in busy
@@ -66,7 +66,7 @@ def test_a_reset_camera_is_waited_for(told: Any) -> None:
     assert resets["found"] == [True, ""]
     assert resets["returned"]
     assert resets["reset_s"] < 1.0
-    # Its going was part of the reset; the next one is not.
+    # The first disappearance was part of the reset; the next one is not.
     assert not resets["removed"]
     assert resets["unplugged"]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which profile is run when the wanted one is not offered."""
+"""The profile that runs if the configured one is not offered."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The RealSense SDK finds its libusb on a machine that has none, and says so where there is none at all."""
+"""The RealSense SDK finds its libusb on a machine without one, and reports it if there is none at all."""
 
 from __future__ import annotations
 
@@ -61,14 +61,14 @@ except SourceError as error:
 """
 
 
-def test_where_the_sdk_is_missing_it_is_told_what_to_install(tmp_path: Path) -> None:
+def test_without_the_sdk_the_error_names_the_packages_to_install(tmp_path: Path) -> None:
     (tmp_path / "pyrealsense2.py").write_text("raise ImportError('no such SDK')")
     ended = run(ASKED, path=tmp_path)
-    assert ended.stdout.startswith("the RealSense SDK cannot be loaded: no such SDK; it takes the packages ")
+    assert ended.stdout.startswith("the RealSense SDK cannot be loaded: no such SDK; install the packages ")
     assert "pip install 'cellwatch[realsense]'" in ended.stdout
 
 
-def test_where_there_is_no_libusb_at_all_both_ways_to_get_it_are_told(tmp_path: Path) -> None:
+def test_without_libusb_the_error_names_both_ways_to_get_it(tmp_path: Path) -> None:
     # A package without a library, before the real one on the path; the process that captures has the same path.
     (tmp_path / "libusb_package").mkdir()
     (tmp_path / "libusb_package" / "__init__.py").touch()

@@ -42,7 +42,7 @@ def test_the_newest_is_taken_once(memory: int) -> None:
     assert reader.take(frame.number) is None
 
 
-def test_what_is_held_stays_until_another_is_taken(memory: int) -> None:
+def test_a_held_frame_stays_until_another_is_taken(memory: int) -> None:
     writer, reader = SharedFrames(memory, SHAPE, np.uint16), SharedFrames(memory, SHAPE, np.uint16)
     writer.write(picture(1), 1, 1, 0)
     first = reader.take(0)

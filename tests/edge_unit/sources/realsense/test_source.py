@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The RealSense source with the real SDK: recordings, cameras that come and go, processes that hang and die."""
+"""The RealSense source with the real SDK: recordings, cameras that come and go, processes that hang and crash."""
 
 from __future__ import annotations
 
@@ -163,18 +163,18 @@ async def test_a_recording_cut_in_half_is_refused_with_its_name(recording: Path,
     half = tmp_path / "half.db3"
     half.write_bytes(recording.read_bytes()[: recording.stat().st_size // 2])
     source = RealsenseSource(RealsenseSourceConfig(recording=half))
-    with pytest.raises(SourceError, match=r"half\.db3: no recording that can be played; it may have been cut short"):
+    with pytest.raises(SourceError, match=r"half\.db3: expected a recording that can be played; it may be truncated"):
         await source.open()
     assert source.pid is None
 
 
 async def test_a_missing_recording_is_named() -> None:
-    with pytest.raises(SourceError, match=r"nowhere\.db3: there is no such recording"):
+    with pytest.raises(SourceError, match=r"nowhere\.db3: expected a recording"):
         await RealsenseSource(RealsenseSourceConfig(recording=Path("nowhere.db3"))).open()
 
 
 async def test_no_frames_before_open() -> None:
-    with pytest.raises(SourceError, match="before it was opened"):
+    with pytest.raises(SourceError, match="expected an open source"):
         async for _ in RealsenseSource(RealsenseSourceConfig()).frames():
             pass
 
@@ -196,7 +196,7 @@ async def test_a_killed_capture_process_costs_no_frame_of_a_recording(recording:
         assert len(pids - {None}) == 3
 
 
-async def test_a_hung_capture_process_is_told_within_a_second_and_replaced(recording: Path) -> None:
+async def test_a_hung_capture_process_is_reported_within_a_second_and_replaced(recording: Path) -> None:
     async with opened(recording=recording, loop=True) as (source, _):
         await until(source, lambda status: status.state == "live")
         hung = source.pid
@@ -205,7 +205,7 @@ async def test_a_hung_capture_process_is_told_within_a_second_and_replaced(recor
         stopped_ns = monotonic_ns()
         status = await until(source, lambda status: status.state != "live")
         assert status.since_ns - stopped_ns < NS_PER_S
-        assert status.trouble == "camera silent: no frame comes from the camera"
+        assert status.trouble == "camera silent: the camera sends no frames"
         status = await until(source, lambda status: status.state == "live")
         assert status.since_ns - stopped_ns < 4 * NS_PER_S
         assert source.pid != hung
@@ -255,11 +255,11 @@ async def test_it_may_be_opened_again(recording: Path) -> None:
 # ---------------------------------------------------------------------- cameras that come and go
 
 
-async def test_an_absent_camera_is_named_with_what_is_there() -> None:
+async def test_an_absent_camera_is_named_with_the_connected_ones() -> None:
     source = RealsenseSource(RealsenseSourceConfig(serial="123456", open_timeout_s=1.0))
     opening = asyncio.create_task(source.open())
     status = await until(source, lambda status: status.state == "absent")
-    assert status.trouble == "camera absent: no RealSense camera 123456 is connected (there is none)"
+    assert status.trouble == "camera absent: no RealSense camera 123456 is connected (connected: none)"
     with pytest.raises(SourceError, match="no RealSense camera 123456 is connected"):
         await opening
     assert source.status.state == "closed"
@@ -287,7 +287,7 @@ async def test_a_camera_may_be_unplugged_and_plugged_in_again(recording: Path, t
         assert status.reason == "camera SYN0001 was unplugged"
         assert status.since_ns - unplugged_ns < NS_PER_S // 2
         status = await until(source, lambda status: status.state == "absent")
-        assert status.reason == "no RealSense camera SYN0001 is connected (there is none)"
+        assert status.reason == "no RealSense camera SYN0001 is connected (connected: none)"
         await asyncio.to_thread(plug, sockets, [recording])
         await until(source, lambda status: status.state == "live")
     await asyncio.sleep(0.2)
@@ -303,7 +303,7 @@ async def test_another_camera_is_never_taken_for_the_first(recording: Path, othe
     source = RealsenseSource(RealsenseSourceConfig(), command(sockets))
     assert (await source.open()).serial == "SYN0001"
     await asyncio.to_thread(plug, sockets, [other])
-    with pytest.raises(SourceError, match=r"the camera was SYN0001 \(424x240\) and is SYN0002 \(424x240\) now"):
+    with pytest.raises(SourceError, match=r"expected the camera SYN0001 \(424x240\), got SYN0002 \(424x240\)"):
         async for _ in source.frames():
             pass
     await source.close()
@@ -322,26 +322,26 @@ async def test_of_two_cameras_one_must_be_chosen(recording: Path, other: Path, t
 # ---------------------------------------------------------------------- the calibration board
 
 
-async def test_a_look_at_the_board_and_depth_goes_on(recording: Path) -> None:
+async def test_depth_resumes_after_images_of_the_board(recording: Path) -> None:
     async with opened(recording=recording, real_time=False) as (source, info):
         frames = source.frames()
         first = [(await anext(frames)).frame_number for _ in range(3)]
-        async with source.look("color") as look:
+        async with source.open_images("color") as feed:
             assert source.status.state == "looking" or source.status.state == "starting"
-            assert look.info.intrinsics.fx == info.intrinsics.fx
-            assert look.info.distortion == (0.0,) * 5
-            np.testing.assert_allclose(look.info.T_depth_image[:3, 3], recordings.COLOR_AT_M, atol=1e-7)
-            np.testing.assert_allclose(look.info.T_depth_image[:3, :3], np.eye(3))
-            images = look.images()
+            assert feed.info.intrinsics.fx == info.intrinsics.fx
+            assert feed.info.distortion == (0.0,) * 5
+            np.testing.assert_allclose(feed.info.T_depth_image[:3, 3], recordings.COLOR_AT_M, atol=1e-7)
+            np.testing.assert_allclose(feed.info.T_depth_image[:3, :3], np.eye(3))
+            images = feed.images()
             for _ in range(2):
                 image = await anext(images)
                 assert image.pixels.shape == (recordings.HEIGHT, recordings.WIDTH, 3)
                 assert (image.pixels == image.frame_number).all()
-        async with source.look("infrared") as look:
-            image = await anext(look.images())
+        async with source.open_images("infrared") as feed:
+            image = await anext(feed.images())
             assert image.pixels.shape == (recordings.HEIGHT, recordings.WIDTH)
             assert (image.pixels == image.frame_number).all()
-            np.testing.assert_allclose(look.info.T_depth_image, np.eye(4))
+            np.testing.assert_allclose(feed.info.T_depth_image, np.eye(4))
         rest = [frame.frame_number async for frame in frames]
         assert first + rest == list(range(1, FRAMES + 1))
 
@@ -349,7 +349,7 @@ async def test_a_look_at_the_board_and_depth_goes_on(recording: Path) -> None:
 async def test_a_stream_that_is_not_there_is_named_and_depth_goes_on(other: Path) -> None:
     async with opened(recording=other, loop=True) as (source, _):
         with pytest.raises(SourceError, match=r"other\.db3: no color stream \(rgb8\) was recorded"):
-            async with source.look("color"):
+            async with source.open_images("color"):
                 pass
         await until(source, lambda status: status.state == "live")
 
@@ -369,6 +369,6 @@ async def test_a_stream_that_is_not_there_is_named_and_depth_goes_on(other: Path
         ({"sereal": "1"}, "Extra inputs"),
     ],
 )
-def test_what_does_not_fit_together_is_refused(wrong: dict[str, Any], text: str) -> None:
+def test_contradictory_settings_are_refused(wrong: dict[str, Any], text: str) -> None:
     with pytest.raises(ValidationError, match=text):
         RealsenseSourceConfig(**wrong)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The watchdog's judgement, without a process and without waiting."""
+"""The watchdog's decisions, without a process and without waiting."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ START_NS = 77 * NS_PER_S
 def streaming(fps: int = 15) -> Watchdog:
     watchdog = Watchdog()
     watchdog.begin(START_NS)
-    watchdog.hear(START_NS, "starting")
+    watchdog.note_message(START_NS, "starting")
     watchdog.stream(START_NS, fps)
     return watchdog
 
@@ -24,16 +24,16 @@ def streaming(fps: int = 15) -> Watchdog:
 def test_each_phase_has_its_own_patience(phase: PhaseName) -> None:
     watchdog = Watchdog()
     watchdog.begin(START_NS)
-    watchdog.hear(START_NS, phase)
+    watchdog.note_message(START_NS, phase)
     patience_ns = round(PATIENCE_S[watchdog.phase] * NS_PER_S)
     assert watchdog.stuck_s(START_NS + patience_ns) is None
     assert watchdog.stuck_s(START_NS + patience_ns + NS_PER_MS) == pytest.approx(PATIENCE_S[watchdog.phase], abs=0.002)
-    watchdog.hear(START_NS + patience_ns)
+    watchdog.note_message(START_NS + patience_ns)
     assert watchdog.stuck_s(START_NS + patience_ns + NS_PER_MS) is None
 
 
 @pytest.mark.parametrize("fps", [6, 15, 30, 90])
-def test_silence_is_told_well_within_a_second_and_never_between_two_frames(fps: int) -> None:
+def test_silence_is_reported_well_within_a_second_and_never_between_two_frames(fps: int) -> None:
     watchdog = streaming(fps)
     assert watchdog.silent_s(START_NS + 2 * NS_PER_S // fps) is None
     assert watchdog.silent_s(START_NS + 700 * NS_PER_MS) == pytest.approx(0.7)
@@ -53,7 +53,7 @@ def test_the_first_restart_is_at_once_the_next_ones_later_and_a_reset_is_tried_e
     for _ in range(8):
         restarts.append(watchdog.end())
         watchdog.begin(START_NS)
-        watchdog.hear(START_NS, "starting")
+        watchdog.note_message(START_NS, "starting")
     assert tuple(restart.delay_s for restart in restarts) == BACK_OFF_S + BACK_OFF_S[-1:] * 2
     assert [restart.reset for restart in restarts] == [False, True] * 4
 
@@ -62,7 +62,7 @@ def test_a_camera_that_was_never_found_is_not_reset() -> None:
     watchdog = Watchdog()
     for _ in range(4):
         watchdog.begin(START_NS)
-        watchdog.hear(START_NS, "waiting")
+        watchdog.note_message(START_NS, "waiting")
         assert not watchdog.end().reset
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import ssl
 from ipaddress import IPv4Address, IPv6Address
 from pathlib import Path
@@ -16,10 +17,14 @@ from edge_unit.sources.realsense.source import RealsenseSourceConfig
 from edge_unit.sources.recorded import RecordedSourceConfig, read_pose
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from edge_unit.tls import normalised, tls_context
+from shared.configuration import Text
 from shared.errors import ConfigError
 from shared.files import default_state_dir
 from shared.messages import MAX_TEXT
-from shared.transforms import Transform, from_xyz_rpy, validated
+from shared.text_files import read_text
+from shared.transforms import Transform, from_xyz_rpy, rounding_warning, validated
+
+logger = logging.getLogger(__name__)
 
 ENVIRONMENT_PREFIX = "CELLWATCH_UNIT_"
 
@@ -57,7 +62,10 @@ class PoseConfig(Configured):
         if self.xyz is not None:
             return from_xyz_rpy(self.xyz, np.radians(self.rpy_deg))
         if self.matrix is not None:
-            return validated(self.matrix, "T_world_camera.matrix")
+            pose = validated(self.matrix, "T_world_camera.matrix")
+            if warning := rounding_warning(self.matrix, pose):
+                logger.warning("T_world_camera.matrix: %s", warning)
+            return pose
         assert self.file is not None
         return read_pose(self.file)
 
@@ -74,7 +82,7 @@ class UnitConfig(Configured):
     master_url: str | None = Field(
         default=None, pattern=r"^https?://[^/\s]+/?$", description="The master; absent: the unit searches for it."
     )
-    cell: str | None = Field(
+    cell: Text | None = Field(
         default=None,
         max_length=MAX_TEXT,
         description="Name of the cell of the wanted master, if several masters are found.",
@@ -155,8 +163,8 @@ class UnitConfig(Configured):
         elif self.token_file is not None:
             where = f"token_file {self.token_file}"
             try:
-                token = self.token_file.read_text(encoding="ascii").strip()
-            except (OSError, UnicodeDecodeError) as error:
+                token = read_text(self.token_file).strip()
+            except (OSError, ValueError) as error:
                 raise ConfigError(f"{where}: cannot be read: {error}") from error
         else:
             raise ConfigError("token: expected token or token_file in the configuration, got neither")

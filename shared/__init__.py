@@ -4,6 +4,7 @@
 In the order of the flow:
 
     errors         the tree of errors that the project raises
+    text_files     text files as editors write them: tables, and YAML whose numbers are numbers
     configuration  YAML, environment and command line merged into one configuration
     files          atomic writes of files, and small state documents in files
     clock          the only place that reads the time

@@ -15,7 +15,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from shared.cell_file import MAX_BODIES, CellFile, DHFile, Name, RobotFile, ShapeFile, named_file, read_cell_file
+from shared.cell_file import (
+    MAX_BODIES,
+    CellFile,
+    DHFile,
+    Name,
+    RobotFile,
+    ShapeFile,
+    named_file,
+    named_folder,
+    read_cell_file,
+)
 from shared.configuration import sentence
 from shared.errors import CellError, InputError, KinematicsError, MeshError
 from shared.joint_table import DHJoint
@@ -359,7 +369,9 @@ def _urdf_robot(file: Path, content: RobotFile, tool: TriangleMesh | None, T_wor
         meshes=content.meshes,
         joints=content.joints,
         held_joints=content.held_joints,
-        packages={name: file.parent / folder for name, folder in content.packages.items()},
+        packages={
+            name: named_folder(file, f"robot.packages.{name}", folder) for name, folder in content.packages.items()
+        },
         link_meshes=replaced,
         tool=tool,
         tool_parent=content.tool.parent if content.tool is not None else None,

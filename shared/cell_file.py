@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from shared.errors import CellError
 from shared.joint_table import MAX_JOINTS
 from shared.meshes import MAX_COORDINATE_M
+from shared.text_files import parse_yaml, read_text
 from shared.transforms import Transform, from_xyz_rpy
 
 MAX_BODIES = 1000
@@ -122,7 +123,7 @@ class RobotFile(_Model):
     """The robot: either a URDF or DH rows."""
 
     urdf: str | None = None
-    meshes: Literal["collision", "visual"] = "collision"
+    meshes: Literal["collision_or_visual", "collision", "visual"] = "collision_or_visual"
     joints: tuple[str, ...] | None = None
     held_joints: dict[str, Number] = Field(default_factory=dict)
     packages: dict[str, str] = Field(default_factory=dict)
@@ -195,13 +196,13 @@ def read_cell_file(path: str | Path) -> CellFile:
     """
     file = Path(path)
     try:
-        text = file.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise CellError(f"{file}: expected a YAML file in UTF-8, got other bytes: {error.reason}") from error
+        text = read_text(file)
+    except ValueError as error:
+        raise CellError(f"{file}: {error}") from error
     except OSError as error:
         raise CellError(f"{file}: expected a readable cell file, got: {error.strerror}") from error
     try:
-        content = yaml.load(text, Loader=_StrictLoader)
+        content = parse_yaml(text)
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark is not None else ""
         raise CellError(f"{file}: {line}expected YAML, got a syntax error: {error.problem}") from error
@@ -228,19 +229,35 @@ def named_file(cell_file: Path, key: str, text: str) -> Path:
         CellError: the variable, the package or the file does not exist; the text names the key.
     """
     where = f"{cell_file}: {key}"
+    found = _named(cell_file, where, text)
+    if not found.is_file():
+        raise CellError(f"{where}: expected a file at {found}, found {'a folder' if found.is_dir() else 'none'}")
+    return found
+
+
+def named_folder(cell_file: Path, key: str, text: str) -> Path:
+    """Return the folder that a path in `cell.yaml` means, by the rules of `named_file`.
+
+    Raises:
+        CellError: the variable or the package is not there, or no such folder is; names the key.
+    """
+    where = f"{cell_file}: {key}"
+    found = _named(cell_file, where, text)
+    if not found.is_dir():
+        raise CellError(f"{where}: expected a folder at {found}, found {'a file' if found.is_file() else 'none'}")
+    return found
+
+
+def _named(cell_file: Path, where: str, text: str) -> Path:
     if text.startswith("package:"):
-        found = _in_package(where, text)
-    elif text.startswith("$"):
+        return _in_package(where, text)
+    if text.startswith("$"):
         variable, _, rest = text[1:].partition("/")
         variable = variable.removeprefix("{").removesuffix("}")
         if not os.environ.get(variable):
             raise CellError(f"{where}: expected the environment variable {variable} to be set, for {text}")
-        found = Path(os.environ[variable]) / rest
-    else:
-        found = cell_file.parent / text
-    if not found.is_file():
-        raise CellError(f"{where}: expected a file at {found}, found none")
-    return found
+        return Path(os.environ[variable]) / rest
+    return cell_file.parent / text
 
 
 def _in_package(where: str, text: str) -> Path:
@@ -257,21 +274,6 @@ def _in_package(where: str, text: str) -> Path:
             return folders[0] / rest
         raise CellError(f"{where}: expected an installed package {package or '(no name)'}, for {text}") from error
     return located
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """A YAML loader that rejects duplicate keys: YAML would drop the first value silently."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
-        for key, _ in node.value:
-            text = str(key.value)
-            if text in seen:
-                raise yaml.constructor.ConstructorError(
-                    "while reading a mapping", node.start_mark, f"duplicate key {text}", key.start_mark
-                )
-            seen.add(text)
-        return super().construct_mapping(node, deep)
 
 
 def _sentence(problem: Mapping[str, Any]) -> str:

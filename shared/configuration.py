@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, BeforeValidator, ValidationError
 
 from shared.errors import ConfigError
+from shared.text_files import parse_yaml, read_text
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -22,6 +23,16 @@ SENTENCE_INPUT_CHARS = 60
 
 NESTING = "__"
 """Separator of levels: `PREFIX_SOURCE__FPS=15` is `source.fps: 15`. Single underscores are part of many names."""
+
+
+def _digits_as_text(value: Any) -> Any:
+    if isinstance(value, float):
+        raise ValueError(f"expected text, got the number {value!r}; put it in quotes")
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+Text = Annotated[str, BeforeValidator(_digits_as_text)]
+"""Text that may be all digits, such as a serial number, without quotes."""
 
 
 def load(
@@ -98,8 +109,8 @@ def _shown(value: Any) -> str:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
+        loaded = parse_yaml(read_text(path))
+    except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from error
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: expected YAML: {' '.join(str(error).split())}") from error
@@ -116,7 +127,7 @@ def _scalar(value: Any, name: str) -> Any:
     if not isinstance(value, str):
         return value
     try:
-        return yaml.safe_load(value)
+        return parse_yaml(value)
     except yaml.YAMLError as error:
         raise ConfigError(f"{name}: expected a YAML value, got {value!r}") from error
     except RecursionError as error:

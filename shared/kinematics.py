@@ -254,7 +254,7 @@ class Robot:
     def from_urdf(
         cls,
         path: str | Path,
-        meshes: MeshKind = "collision",
+        meshes: MeshKind = "collision_or_visual",
         joints: Sequence[str] | None = None,
         held_joints: Mapping[str, float] | None = None,
         packages: Mapping[str, Path] | None = None,

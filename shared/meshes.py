@@ -9,6 +9,8 @@ rendered from both sides.
 from __future__ import annotations
 
 import hashlib
+import io
+import logging
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,10 +24,12 @@ from numpy.typing import ArrayLike, NDArray
 from shared.errors import MeshError
 from shared.transforms import Transform
 
+logger = logging.getLogger(__name__)
+
 MAX_TRIANGLES = 1_000_000
 """Limit of triangles: 18 MB of canonical bytes and about a second to render on a unit; finer CAD is a mistake."""
 
-FILE_SUFFIXES = (".stl", ".obj", ".dae", ".ply")
+FILE_SUFFIXES = (".stl", ".obj", ".dae", ".ply", ".glb")
 
 MERGE_DISTANCE_M = 1e-6
 """Distance below which vertices are merged; STL repeats each vertex in every triangle that uses it."""
@@ -35,6 +39,15 @@ MIN_TRIANGLE_AREA_M2 = 1e-12
 
 MAX_COORDINATE_M = 1000.0
 """Limit of coordinates. No cell is a kilometre wide: larger values mean a file in millimetres without its `scale`."""
+
+_STL_HEADER_BYTES, _STL_TRIANGLE_BYTES = 84, 50
+"""Of a binary STL: 80 bytes of text and the count of triangles; three corners, a normal and two bytes for each."""
+
+_STL_PROBE_BYTES = 1024
+"""From the start of an STL: enough for the first facet of one in ASCII."""
+
+_LFS_POINTER = b"version https://git-lfs"
+"""The start of the text that stands where Git LFS has not fetched a file."""
 
 CIRCLE_SEGMENTS = 48
 """Segments of a circle: a cylinder of 0.1 m radius is then at most 0.2 mm inside the true surface."""
@@ -58,7 +71,7 @@ class TriangleMesh:
         name: a name for messages; not part of the canonical bytes.
         vertices: (V, 3) float32, metres, mesh frame.
         faces: (F, 3) int32, indices into `vertices`.
-        closed: True if the mesh bounds a volume and all its triangles face outwards.
+        closed: it bounds a volume and all its triangles face outwards, into a hollow inside as well.
     """
 
     name: str
@@ -115,7 +128,7 @@ class TriangleMesh:
         closed = _bounds_volume(triangles)
         points = merged.astype(np.float64)
         if closed:
-            triangles = _face_outwards(points, triangles)
+            triangles, closed = _face_outwards(points, triangles)
         a, b, c = points[triangles[:, 0]], points[triangles[:, 1]], points[triangles[:, 2]]
         areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
         triangles = triangles[areas > MIN_TRIANGLE_AREA_M2]
@@ -184,7 +197,7 @@ def concatenated(name: str, meshes: list[TriangleMesh]) -> TriangleMesh:
 
 
 def load_mesh(path: str | Path, scale: float | Sequence[float] = 1.0, name: str | None = None) -> TriangleMesh:
-    """Read an STL, OBJ, DAE or PLY file.
+    """Read an STL, OBJ, DAE, PLY or GLB file.
 
     The parts of a scene become one mesh by their own transforms. COLLADA's unit of length is applied and its up axis
     ignored, as RViz does.
@@ -205,6 +218,13 @@ def load_mesh(path: str | Path, scale: float | Sequence[float] = 1.0, name: str 
         raise MeshError(f"{file}: expected a mesh file ({', '.join(FILE_SUFFIXES)}), got {file.suffix or file.name!r}")
     if not file.is_file():
         raise MeshError(f"{file}: expected a mesh file, got {'a folder' if file.is_dir() else 'no such file'}")
+    try:
+        with file.open("rb") as opened:
+            start = opened.read(len(_LFS_POINTER))
+    except OSError as error:
+        raise MeshError(f"{file}: expected a readable mesh file, got {error.strerror}") from error
+    if start == _LFS_POINTER:
+        raise MeshError(f"{file}: expected a mesh, got a Git LFS pointer to one; fetch it with `git lfs pull`")
     vertices, faces = _read_triangles(file)
     if not len(faces):
         raise MeshError(f"{file}: expected a mesh with triangles, got none: the file is empty or damaged")
@@ -247,6 +267,18 @@ def sphere_mesh(name: str, radius_m: float) -> TriangleMesh:
     return _primitive(name, "icosphere", subdivisions=3, radius=radius_m)
 
 
+def capsule_mesh(name: str, radius_m: float, length_m: float) -> TriangleMesh:
+    """A cylinder of `length_m` about the origin along z with half a sphere on each end."""
+    counts = (CIRCLE_SEGMENTS // 2, CIRCLE_SEGMENTS)
+    return _primitive(name, "capsule", radius=radius_m, height=length_m, count=counts)
+
+
+def ellipsoid_mesh(name: str, size_m: ArrayLike) -> TriangleMesh:
+    """An ellipsoid about the origin, `size_m` (3,) its diameters."""
+    sphere = sphere_mesh(name, 0.5)
+    return TriangleMesh.of_triangles(name, sphere.vertices * np.asarray(size_m, dtype=np.float64), sphere.faces)
+
+
 def _primitive(name: str, kind: str, **sizes: Any) -> TriangleMesh:
     import trimesh
 
@@ -260,11 +292,15 @@ def _read_triangles(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]
     import trimesh
 
     try:
-        scene = trimesh.load_scene(file, process=False, skip_materials=True)
+        content = _stl_content(file) if file.suffix.lower() == ".stl" else None
+        source = file if content is None else io.BytesIO(content)
+        scene = trimesh.load_scene(source, file_type=file.suffix.lower()[1:], process=False, skip_materials=True)
         parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
         is_collada = file.suffix.lower() == ".dae"
         unit_m = trimesh.units.unit_conversion(scene.units, "meters") if is_collada and scene.units else 1.0
-    # Damaged files raise many kinds of errors in the readers: struct, index, value, XML and import errors.
+    except MeshError:
+        raise
+    # The readers raise whatever the damage happens to lead to: struct, index, value, XML and import errors.
     except Exception as error:
         raise MeshError(f"{file}: expected a readable mesh, got {type(error).__name__}: {error}") from error
     vertices = [np.asarray(part.vertices, dtype=np.float64) * unit_m for part in parts]
@@ -273,6 +309,31 @@ def _read_triangles(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]
     if not parts:
         return np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
     return np.concatenate(vertices), np.concatenate([part + starts[i] for i, part in enumerate(faces)])
+
+
+def _stl_content(file: Path) -> bytes | None:
+    """The bytes of a binary STL as far as its header counts, None of one in ASCII.
+
+    Raises:
+        MeshError: it is shorter than its header says.
+        OSError: it cannot be read.
+    """
+    content = file.read_bytes()
+    # Binary headers may begin with "solid", too; only text goes on with a facet.
+    text = content[:_STL_PROBE_BYTES].lower()
+    if text.lstrip().startswith(b"solid") and (b"facet" in text or b"endsolid" in text):
+        return None
+    if len(content) < _STL_HEADER_BYTES:
+        raise MeshError(f"{file}: expected an STL file of at least {_STL_HEADER_BYTES} bytes, got {len(content)}")
+    (triangles,) = struct.unpack_from("<I", content, _STL_HEADER_BYTES - 4)
+    expected = _STL_HEADER_BYTES + _STL_TRIANGLE_BYTES * triangles
+    if len(content) < expected:
+        raise MeshError(
+            f"{file}: expected {expected} bytes for {triangles} triangles, got {len(content)}; it is cut off, or no STL"
+        )
+    if len(content) > expected:
+        logger.warning("%s: passed over %d bytes after its %d triangles", file, len(content) - expected, triangles)
+    return content[:expected]
 
 
 def _merge_vertices(vertices: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
@@ -298,12 +359,36 @@ def _bounds_volume(faces: NDArray[np.int64]) -> bool:
     return bool(len(edges)) and not np.add.reduceat(direction, starts).any()
 
 
-def _face_outwards(points: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Reverse the triangles of those parts of a closed surface whose volume is negative."""
+def _face_outwards(points: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], bool]:
+    """Turn the parts of a closed surface that face inwards, but for those that bound a hollow inside another part.
+
+    Returns the faces (F, 3), and False when a part was turned: a solid that was exported inside out, or a room that is
+    seen from inside. Which of them it is nobody can tell, so both its sides must be drawn.
+    """
     part = _connected_parts(len(points), faces)[faces[:, 0]]
     a, b, c = (points[faces[:, k]] for k in range(3))
     six_volumes = np.bincount(part, weights=np.einsum("ij,ij->i", a, np.cross(b, c)))
-    return np.where((six_volumes < 0.0)[part][:, None], faces[:, ::-1], faces)
+    inwards = [label for label in np.flatnonzero(six_volumes < 0.0) if not _is_hollow(points, faces, part, label)]
+    turned = np.isin(part, inwards)
+    return np.where(turned[:, None], faces[:, ::-1], faces), not turned.any()
+
+
+def _is_hollow(
+    points: NDArray[np.float64], faces: NDArray[np.int64], part: NDArray[np.int64], label: np.intp | int
+) -> bool:
+    """Return True if a part lies inside the other parts: the surfaces around it add up to a winding number of 1."""
+    own = part == label
+    inside = points[faces[own][0, 0]]
+    corners = points[faces[~own]] - inside
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    length_a, length_b, length_c = (np.linalg.norm(corners[:, k], axis=1) for k in range(3))
+    # The solid angle of each triangle (Van Oosterom and Strackee, 1983).
+    triple = np.einsum("ij,ij->i", a, np.cross(b, c))
+    rest = length_a * length_b * length_c
+    rest += np.einsum("ij,ij->i", a, b) * length_c
+    rest += np.einsum("ij,ij->i", b, c) * length_a
+    rest += np.einsum("ij,ij->i", c, a) * length_b
+    return bool(2.0 * np.arctan2(triple, rest).sum() / (4.0 * np.pi) > 0.5)
 
 
 def _connected_parts(vertex_count: int, faces: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -16,8 +16,14 @@ from shared.errors import InputError
 
 Transform: TypeAlias = NDArray[np.float64]
 
-ROTATION_TOLERANCE = 1e-4
-"""Largest deviation of `R @ R.T` from the identity; text files give poses with few digits."""
+ROTATION_TOLERANCE = 2e-3
+"""How far `R @ R.T` may be from the identity: three decimals of each number leave it off by up to 1.7e-3."""
+
+EXACT = 1e-12
+"""A rotation that is orthonormal as far as this is left as it is, digit by digit."""
+
+NOTABLE_ROUNDING = 1e-5
+"""A rotation that was off by more had fewer than five decimals: points at 3 m are off by up to 0.05 mm and more."""
 
 LAST_ROW_TOLERANCE = 1e-6
 """Largest deviation of the last row from 0 0 0 1; products and inverses in float32 are off by about 1e-7."""
@@ -32,6 +38,8 @@ def identity() -> Transform:
 
 def validated(value: ArrayLike, name: str) -> Transform:
     """Return `value` as a (4, 4) float64 rigid transform: a copy whose last row is exactly 0 0 0 1.
+
+    A rotation that is orthonormal but for the rounding of a printed matrix is replaced by the nearest one that is.
 
     Raises:
         InputError: `value` is not (4, 4) or not finite, its rotation is not orthonormal and right-handed, or its last
@@ -55,7 +63,18 @@ def validated(value: ArrayLike, name: str) -> Transform:
             f"{name}: expected a right-handed rotation, got one that is off by {deviation:.2g} "
             f"with determinant {np.linalg.det(rotation):.3f}"
         )
+    if deviation > EXACT:
+        left, _, right = np.linalg.svd(rotation)
+        matrix[:3, :3] = left @ right
     return matrix
+
+
+def rounding_warning(value: ArrayLike, pose: Transform) -> str | None:
+    """Return a sentence for a `value` whose rotation was notably rounded before `validated` made `pose` of it."""
+    off_by = float(np.abs(np.asarray(value, dtype=np.float64)[:3, :3] - pose[:3, :3]).max())
+    if off_by <= NOTABLE_ROUNDING:
+        return None
+    return f"its rotation has few decimals; the nearest one that is orthonormal is taken, {off_by:.1g} off"
 
 
 def from_rotation_translation(rotation: ArrayLike, translation_m: ArrayLike) -> Transform:

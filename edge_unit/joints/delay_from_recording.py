@@ -21,6 +21,7 @@ from edge_unit.sources.recorded import RecordedSource, RecordedSourceConfig
 from shared.cell import Cell
 from shared.errors import InputError, SourceError
 from shared.settings import FilterSettings
+from shared.text_files import parse_numbers, read_text
 
 FRAME_TIMES = "frame_times_s.csv"
 JOINT_SAMPLES = "joint_samples.csv"
@@ -86,11 +87,9 @@ class JointSamples:
 def _table(path: Path, columns: int) -> NDArray[np.float64]:
     """Return rows of so many finite numbers."""
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise ValueError(f"expected at most {MAX_FILE_BYTES} bytes")
-        table = np.loadtxt(path, delimiter=",", ndmin=2)
+        table = parse_numbers(read_text(path))
     except (OSError, ValueError) as error:
         raise SourceError(f"{path}: {' '.join(str(error).split())}") from error
-    if table.shape[1] != columns or not np.isfinite(table).all():
-        raise SourceError(f"{path}: expected rows of {columns} finite numbers, got {table.shape[1]}")
-    return np.asarray(table, np.float64)
+    if table.shape[1] != columns:
+        raise SourceError(f"{path}: expected rows of {columns} numbers, got {table.shape[1]}")
+    return table

@@ -10,28 +10,34 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import io
+import logging
 import os
 import re
 import zipfile
 from collections.abc import AsyncGenerator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from edge_unit.sources.camera_info_file import read_camera_info
 from edge_unit.sources.frame import CameraInfo, DepthFrame
 from shared.camera import D435_BASELINE_M, Intrinsics
 from shared.clock import NS_PER_S, monotonic_ns
-from shared.configuration import sentence
+from shared.configuration import Text
 from shared.errors import CellwatchError, ConfigError, InputError, SourceError
-from shared.transforms import Transform, validated
+from shared.text_files import parse_numbers, read_text
+from shared.transforms import Transform, rounding_warning, validated
 
-SUFFIXES = (".png", ".npz", ".npy")
+logger = logging.getLogger(__name__)
+
+IMAGE_SUFFIXES = (".png", ".tif", ".tiff")
+
+SUFFIXES = (*IMAGE_SUFFIXES, ".npz", ".npy")
 
 NPZ_NAME = "depth"
 """Name of the array in an npz; a single array may have any name."""
@@ -48,6 +54,9 @@ MAX_FILE_BYTES = 256 * 2**20
 
 MAX_FRAMES = 100_000
 """Limit of frames of a recording, named one by one; two hours at 15 fps."""
+
+DEPTH_MAX_M = 200.0
+"""Of an image in metres: farther than any depth camera measures, and nearer than a wall is in millimetres."""
 
 ExpandedPath = Annotated[Path, BeforeValidator(lambda value: os.path.expandvars(os.path.expanduser(value)))]
 """May start with `~` or a variable such as `$CELLWATCH_DATA`."""
@@ -68,23 +77,12 @@ class RecordedSourceConfig(BaseModel):
     depth_scale_m: float = Field(default=0.001, ge=1e-6, le=0.1)
     fx_stereo: float | None = Field(default=None, gt=0.0, description="Focal length at which the imagers match.")
     stereo_baseline_m: float = Field(default=D435_BASELINE_M, ge=0.005, le=1.0)
-    serial: str | None = Field(
+    serial: Text | None = Field(
         default=None, min_length=1, max_length=200, description="Absent: the folder's name and a hash of its path."
     )
     camera_info: str = "camera_info.yaml"
     pose: str = Field(default="T_base_optical.txt", description="T_world_camera; none where there is no such file.")
     joints: str = Field(default="joint_states_rad.csv", description="A row a frame; none where there is no such file.")
-
-
-class _RosCameraInfo(BaseModel):
-    """The required part of a `sensor_msgs/CameraInfo` as YAML; other fields are ignored."""
-
-    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
-
-    width: int
-    height: int
-    k: list[float] = Field(min_length=9, max_length=9)
-    d: list[float] = []
 
 
 @dataclass(frozen=True)
@@ -142,15 +140,23 @@ class RecordedSource:
 
 
 def read_pose(path: Path) -> Transform:
-    """Read a 4x4 matrix from a text file.
+    """Read `T_world_camera` from a text file: a 4x4 matrix, its first three rows, or all 16 numbers in one row.
 
     Raises:
         ConfigError: it cannot be read, or is not a rigid transform; the text names the file.
     """
     try:
-        return validated(np.loadtxt(path, ndmin=2), "T_world_camera")
+        matrix = parse_numbers(read_text(path))
+        if matrix.shape == (1, 16):
+            matrix = matrix.reshape(4, 4)
+        elif matrix.shape == (3, 4):
+            matrix = np.vstack((matrix, (0.0, 0.0, 0.0, 1.0)))
+        pose = validated(matrix, "T_world_camera")
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: {error}") from error
+    if warning := rounding_warning(matrix, pose):
+        logger.warning("%s: T_world_camera: %s", path, warning)
+    return pose
 
 
 def open_recording(config: RecordedSourceConfig) -> CameraInfo:
@@ -176,7 +182,7 @@ def _open(config: RecordedSourceConfig) -> _Recording:
         info = CameraInfo(
             config.serial or _serial(folder),
             "recorded",
-            _intrinsics(folder / config.camera_info, config),
+            _intrinsics(folder / config.camera_info, files[0], config),
             read_pose(pose) if pose.is_file() else None,
         )
     except SourceError:
@@ -209,63 +215,84 @@ def _named(images: Path, every: list[Path], name: str | int) -> Path:
     raise SourceError(f"{images}: no frame {name!r}; expected names such as {every[0].stem}, or 0 to {len(every) - 1}")
 
 
-def _intrinsics(path: Path, config: RecordedSourceConfig) -> Intrinsics:
+def _intrinsics(path: Path, first: Path, config: RecordedSourceConfig) -> Intrinsics:
+    """The intrinsics of the images of which `first` is one."""
+    pinhole = read_camera_info(path, _shape(first))
     try:
-        found = _RosCameraInfo.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
-        if any(found.d):
-            raise SourceError(f"{path}: expected an image without distortion, got d = {found.d}; rectify it first")
         return Intrinsics(
-            width=found.width,
-            height=found.height,
-            fx=found.k[0],
-            fy=found.k[4],
-            cx=found.k[2],
-            cy=found.k[5],
+            width=pinhole.width,
+            height=pinhole.height,
+            fx=pinhole.fx,
+            fy=pinhole.fy,
+            cx=pinhole.cx,
+            cy=pinhole.cy,
             depth_scale_m=config.depth_scale_m,
             stereo_baseline_m=config.stereo_baseline_m,
             fx_stereo=config.fx_stereo,
         )
-    except ValidationError as error:
-        raise SourceError(f"{path}: {sentence(error)}") from error
     except InputError as error:
         raise SourceError(f"{path}: {error}") from error
-    except yaml.YAMLError as error:
-        raise SourceError(f"{path}: expected YAML: {' '.join(str(error).split())}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"{path}: cannot be read: {error}") from error
 
 
 def _joints(path: Path, frame_count: int) -> NDArray[np.float64]:
     """Read joint positions (frames, n)."""
     try:
-        rows: NDArray[np.float64] = np.loadtxt(path, delimiter=",", ndmin=2)
+        rows = parse_numbers(read_text(path))
     except (OSError, ValueError) as error:
-        raise SourceError(f"{path}: expected a row of numbers for each frame: {error}") from error
+        raise SourceError(f"{path}: expected a row of joint positions for each frame: {error}") from error
     if len(rows) != frame_count:
         raise SourceError(f"{path}: expected {frame_count} rows, one for each depth image, got {len(rows)}")
-    if not np.isfinite(rows).all():
-        raise SourceError(f"{path}: expected finite joint positions, got NaN or infinity")
     return rows
+
+
+def _shape(path: Path) -> tuple[int, int]:
+    """(height, width) of a depth image."""
+    depth = _opened(path)
+    if depth.ndim != 2:
+        raise SourceError(f"{path}: expected a depth image of one channel, got an array of shape {depth.shape}")
+    return int(depth.shape[0]), int(depth.shape[1])
 
 
 def _read_image(path: Path, intrinsics: Intrinsics) -> NDArray[np.uint16]:
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise SourceError(f"{path}: expected at most {MAX_FILE_BYTES} bytes")
-        depth = _decoded(path)
-        return intrinsics.check_depth(depth)
+        return intrinsics.check_depth(_raw_depth(_opened(path), intrinsics.depth_scale_m))
     except InputError as error:
         raise SourceError(f"{path}: {error}") from error
+
+
+def _raw_depth(depth: NDArray[Any], depth_scale_m: float) -> NDArray[Any]:
+    """Depth in metres (float, NaN or infinite where nothing was measured) as uint16 in units of `depth_scale_m`.
+
+    Other images are returned as they are. Depth beyond what uint16 holds counts as not measured.
+    """
+    if depth.dtype.kind != "f":
+        return depth
+    finite = depth[np.isfinite(depth)]
+    if finite.size and finite.max() > DEPTH_MAX_M:
+        raise InputError(
+            f"depth: expected metres in an image of {depth.dtype}, got values up to {finite.max():.4g}; "
+            "write millimetres as uint16"
+        )
+    with np.errstate(invalid="ignore", over="ignore"):
+        units = np.rint(depth.astype(np.float64) / depth_scale_m)
+        return np.where((units >= 1.0) & (units <= np.iinfo(np.uint16).max), units, 0.0).astype(np.uint16)
+
+
+def _opened(path: Path) -> NDArray[Any]:
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise SourceError(f"{path}: expected at most {MAX_FILE_BYTES} bytes")
+        return _decoded(path)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise SourceError(f"{path}: cannot be read: {error}") from error
 
 
-def _decoded(path: Path) -> object:
-    if path.suffix == ".png":
+def _decoded(path: Path) -> NDArray[Any]:
+    if path.suffix in IMAGE_SUFFIXES:
         encoded = np.fromfile(path, dtype=np.uint8)
         image = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if encoded.size else None
         if image is None:
-            raise SourceError(f"{path}: expected a PNG image, got another file")
+            raise SourceError(f"{path}: expected an image, got another file")
         return image
     # Read here, since numpy leaves a broken file open.
     loaded = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
@@ -275,4 +302,5 @@ def _decoded(path: Path) -> object:
         names = loaded.files
         if NPZ_NAME not in names and len(names) != 1:
             raise SourceError(f"{path}: expected an array named {NPZ_NAME}, got {', '.join(names) or 'none'}")
-        return loaded[NPZ_NAME if NPZ_NAME in names else names[0]]
+        array: NDArray[Any] = loaded[NPZ_NAME if NPZ_NAME in names else names[0]]
+        return array

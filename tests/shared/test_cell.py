@@ -308,7 +308,7 @@ BAD = {
     "missing object": ("objects: [{name: a, mesh: gone.stl}]\n", "objects[0].mesh: expected a file at"),
     "empty stl": (
         "static: [{name: a, mesh: empty.stl}]\n",
-        "static[0].mesh: {folder}/empty.stl: expected a mesh with tri",
+        "static[0].mesh: {folder}/empty.stl: expected an STL file of at least",
     ),
     "noise": ("static: [{name: a, mesh: noise.ply}]\n", "static[0].mesh: {folder}/noise.ply: expected a readable mesh"),
     "millimetres": ("static: [{name: a, mesh: mm.stl}]\n", "for a file in millimetres set scale 0.001"),

@@ -126,7 +126,10 @@ BAD = {
     ),
     "twice": ("static: []\nstatic: []\n", "line 4: expected YAML, got a syntax error: duplicate key static"),
     "scale": ("static: [{name: a, mesh: a.stl, scale: -1}]\n", "static[0].scale: expected greater than 0, got -1"),
-    "text": ("static: [{name: a, mesh: a.stl, scale: 1e-3}]\n", "static[0].scale: expected a number, got '1e-3'"),
+    "text": (
+        "static:\n  - name: a\n    mesh: a.stl\n    scale: 0,001\n",
+        "static[0].scale: expected a number, got '0,001'",
+    ),
     "truth": ("static: [{name: a, mesh: a.stl, scale: true}]\n", "static[0].scale: expected a number, got True"),
     "nan": ("static: [{name: a, box: [1, 1, .nan]}]\n", "static[0].box[2]: expected a finite number, got nan"),
     "pair": ("objects: [{name: a, box: [1, 1]}]\n", "objects[0].box[2]: expected a value, got none"),
@@ -149,7 +152,10 @@ BAD = {
         "robot: expected tool.parent only beside urdf",
     ),
     "no rows": ("robot: {dh: {joints: []}}\n", "robot.dh.joints: expected at least 1 entries, got 0"),
-    "meshes": ("robot: {urdf: r, meshes: hull}\n", "robot.meshes: expected 'collision' or 'visual', got 'hull'"),
+    "meshes": (
+        "robot: {urdf: r, meshes: hull}\n",
+        "robot.meshes: expected 'collision_or_visual', 'collision' or 'visual', got 'hull'",
+    ),
     "marker": (
         "board: {columns: 5, rows: 7, square_m: 0.04, marker_m: 0.04}\n",
         "board: expected marker_m below square_m = 0.04, got 0.04",
@@ -166,7 +172,7 @@ BAD = {
     "no list": ("static: {a: 1}\n", "static: expected a list, got keys and values"),
     "no keys": ("robot: [1]\n", "robot: expected keys and values, got a list"),
     "nothing": ("static: [null]\n", "static[0]: expected keys and values, got nothing"),
-    "date": ("robot: {urdf: 2026-01-01}\n", "robot.urdf: expected text, got something else"),
+    "list": ("robot: {urdf: [a]}\n", "robot.urdf: expected text, got a list"),
     "yaml": ("static: [\n", "line 4: expected YAML, got a syntax error: expected the node content"),
 }
 
@@ -199,7 +205,7 @@ def test_every_problem_gets_its_own_sentence(tmp_path: Path) -> None:
     [
         (b"", "expected keys and values, got NoneType"),
         (b"- 1\n", "expected keys and values, got list"),
-        (b"\xff\xfe\x00", "expected a YAML file in UTF-8"),
+        (b"\xff\xfe\x00", "expected text in UTF-8"),
         (b"name: c\n", "box: expected a value, got none"),
         (b"!!python/object:os.system {}\n", "expected YAML, got a syntax error: could not determine a constructor"),
     ],

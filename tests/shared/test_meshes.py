@@ -101,7 +101,7 @@ def test_inside_out_solids_are_reversed_separately() -> None:
     away = np.add(vertices, (10.0, 0.0, 0.0))
     turned = np.concatenate((faces, faces[:, ::-1] + len(vertices)))
     mesh = TriangleMesh.of_triangles("two", np.concatenate((vertices, away)), turned)
-    assert mesh.closed
+    assert not mesh.closed
     assert volume_m3(mesh) == pytest.approx(12.0)
 
 
@@ -245,10 +245,10 @@ def test_malformed_headers_are_refused(header: tuple[bytes, int, int, int], body
 
 
 BAD_FILES = {
-    "empty.stl": (b"", "expected a mesh with triangles, got none"),
+    "empty.stl": (b"", "expected an STL file of at least 84 bytes, got 0"),
     "hollow.stl": (b"solid x\nendsolid x\n", "expected a mesh with triangles, got none"),
-    "noise.stl": (bytes(range(200)), "expected a mesh with triangles, got none"),
-    "cut.stl": (b"\0" * 80 + struct.pack("<I", 9) + b"\0" * 50, "expected a mesh with triangles, got none"),
+    "noise.stl": (bytes(range(200)), "got 200; it is cut off, or no STL"),
+    "cut.stl": (b"\0" * 80 + struct.pack("<I", 9) + b"\0" * 50, "expected 534 bytes for 9 triangles, got 134"),
     "index.obj": (b"v 0 0 0\nf 1 2 3\n", "expected a readable mesh"),
     "header.ply": (b"ply\n", "expected a readable mesh"),
     "broken.dae": (b"<COLLADA>", "expected a readable mesh"),
@@ -295,7 +295,7 @@ def test_order_of_triangles_does_not_matter_to_closedness(order: list[int], shif
     shuffled = np.roll(faces[list(order)], shift, axis=1)
     for inside_out in (False, True):
         mesh = TriangleMesh.of_triangles("b", vertices, shuffled[:, ::-1] if inside_out else shuffled)
-        assert mesh.closed
+        assert mesh.closed is not inside_out
         assert volume_m3(mesh) == pytest.approx(6.0)
 
 
@@ -303,3 +303,84 @@ def test_every_edge_of_a_box_is_shared() -> None:
     mesh = box_mesh("b", (1, 1, 1))
     edges = [tuple(sorted((int(f[i]), int(f[j])))) for f in mesh.faces for i, j in itertools.combinations(range(3), 2)]
     assert all(edges.count(edge) == 2 for edge in edges)
+
+
+def binary_stl(tmp_path: Path, *, header: bytes = b"", extra: int = 0, lost: int = 0) -> Path:
+    content = trimesh.creation.box(extents=(0.2, 0.3, 0.4)).export(file_type="stl")
+    assert isinstance(content, bytes)
+    file = tmp_path / "box.stl"
+    whole = header.ljust(80, b" ") + content[80:] + bytes(extra)
+    file.write_bytes(whole[: len(whole) - lost])
+    return file
+
+
+@pytest.mark.parametrize(("header", "extra"), [(b"", 0), (b"", 1), (b"", 10), (b"solid of a CAD", 0), (b"solid", 3)])
+def test_a_binary_stl_is_read_as_far_as_its_header_counts(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, header: bytes, extra: int
+) -> None:
+    mesh = load_mesh(binary_stl(tmp_path, header=header, extra=extra))
+    assert (len(mesh.faces), mesh.closed) == (12, True)
+    assert (f"passed over {extra} bytes" in caplog.text) == (extra > 0)
+
+
+def test_a_cut_off_stl_is_refused_with_its_bytes(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match="expected 684 bytes for 12 triangles, got 683; it is cut off"):
+        load_mesh(binary_stl(tmp_path, lost=1))
+    with pytest.raises(MeshError, match="at least 84 bytes, got 80"):
+        load_mesh(binary_stl(tmp_path, lost=604))
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".obj", ".dae"])
+def test_a_pointer_of_git_lfs_is_named_as_one(tmp_path: Path, suffix: str) -> None:
+    file = tmp_path / f"arm{suffix}"
+    file.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n")
+    with pytest.raises(MeshError, match="Git LFS pointer"):
+        load_mesh(file)
+
+
+def test_a_glb_is_read(tmp_path: Path) -> None:
+    trimesh.creation.box(extents=(0.2, 0.3, 0.4)).export(tmp_path / "box.glb")
+    mesh = load_mesh(tmp_path / "box.glb")
+    assert mesh.closed
+    np.testing.assert_allclose(mesh.bounds_m[1], (0.1, 0.15, 0.2), atol=1e-6)
+
+
+def shell(size_m: float, *, inwards: bool = False, at_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a cube."""
+    cube = box_mesh("cube", (size_m, size_m, size_m))
+    return cube.vertices + np.float32((at_m, 0, 0)), cube.faces[:, ::-1] if inwards else cube.faces
+
+
+def joined(*shells: tuple[np.ndarray, np.ndarray]) -> TriangleMesh:
+    starts = np.cumsum([0] + [len(vertices) for vertices, _ in shells[:-1]])
+    return TriangleMesh.of_triangles(
+        "joined",
+        np.concatenate([vertices for vertices, _ in shells]),
+        np.concatenate([faces + start for (_, faces), start in zip(shells, starts, strict=True)]),
+    )
+
+
+def test_a_hollow_keeps_facing_inwards() -> None:
+    room = joined(shell(4.0), shell(3.0, inwards=True))
+    assert room.closed
+    assert volume_m3(room) == pytest.approx(64.0 - 27.0)
+    nested = joined(shell(4.0), shell(3.0, inwards=True), shell(1.0), shell(0.5, inwards=True))
+    assert nested.closed
+    assert volume_m3(nested) == pytest.approx(64.0 - 27.0 + 1.0 - 0.125)
+
+
+def test_a_hollow_in_one_part_of_many_is_found() -> None:
+    parts = [shell(1.0, at_m=2.0 * i) for i in range(20)]
+    mesh = joined(*parts, shell(0.5, inwards=True, at_m=14.0))
+    assert mesh.closed
+    assert volume_m3(mesh) == pytest.approx(20.0 - 0.125)
+
+
+def test_a_part_that_faces_inwards_is_turned_and_drawn_from_both_sides() -> None:
+    """It is a solid exported inside out, or a room's inner surface; the file cannot tell."""
+    for mesh, volume in (
+        (joined(shell(2.0, inwards=True)), 8.0),
+        (joined(shell(2.0), shell(1.0, inwards=True, at_m=5.0)), 9.0),
+    ):
+        assert not mesh.closed
+        assert volume_m3(mesh) == pytest.approx(volume)

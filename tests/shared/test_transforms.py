@@ -135,7 +135,30 @@ def test_invalid_poses_are_refused(value: Any, words: str) -> None:
 
 def test_pose_with_few_digits_is_accepted() -> None:
     written = np.round(transforms.from_xyz_rpy((0.1, 0.2, 0.3), (0.4, 0.5, 0.6)), 5)
-    np.testing.assert_array_equal(transforms.validated(written, "T"), written)
+    taken = transforms.validated(written, "T")
+    np.testing.assert_allclose(taken, written, atol=1e-5)
+    np.testing.assert_allclose(taken[:3, :3] @ taken[:3, :3].T, np.eye(3), atol=1e-15)
+
+
+@pytest.mark.parametrize(("decimals", "off", "notable"), [(6, 2e-6, False), (4, 2e-4, True), (3, 2e-3, True)])
+def test_any_pose_of_few_decimals_becomes_the_nearest_rotation(decimals: int, off: float, notable: bool) -> None:
+    random = np.random.default_rng(3)
+    warned = 0
+    for _ in range(300):
+        rotation = transforms.rotation_about(random.normal(size=3), random.uniform(0.0, np.pi))
+        pose = transforms.from_rotation_translation(rotation, random.uniform(-2.0, 2.0, 3))
+        written = np.round(pose, decimals)
+        taken = transforms.validated(written, "T")
+        np.testing.assert_allclose(taken, pose, atol=off)
+        np.testing.assert_allclose(transforms.inverse(taken) @ taken, np.eye(4), atol=1e-14)
+        warned += transforms.rounding_warning(written, taken) is not None
+    assert (warned > 270) if notable else (warned == 0)
+
+
+def test_an_exact_pose_is_left_digit_by_digit() -> None:
+    pose = transforms.from_xyz_rpy((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
+    np.testing.assert_array_equal(transforms.validated(pose, "T"), pose)
+    assert transforms.rounding_warning(pose, transforms.validated(pose, "T")) is None
 
 
 @pytest.mark.parametrize("off", [1e-8, -3e-7, 1e-6])

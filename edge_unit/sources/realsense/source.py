@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from edge_unit.sources.camera_info_file import DISTORTION_MAX_PX, distortion_px
 from edge_unit.sources.frame import CameraInfo, DepthFrame
 from edge_unit.sources.image import ImageFrame, ImageInfo, ImageStream
 from edge_unit.sources.realsense import capture_link as link
@@ -27,7 +28,9 @@ from edge_unit.sources.recorded import ExpandedPath
 from edge_unit.sources.status import SourceStatus, StatusBoard
 from shared.camera import D435_BASELINE_M, Intrinsics
 from shared.clock import NS_PER_MS
+from shared.configuration import Text
 from shared.errors import InputError, SourceError
+from shared.text_files import parse_numbers, read_text
 
 SIZES = ((424, 240), (480, 270), (640, 480), (848, 480), (1280, 720))
 """Depth image sizes that every camera of the D400 family offers; 848x480 is the native size of its stereo."""
@@ -39,7 +42,7 @@ class RealsenseSourceConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     kind: Literal["realsense"] = "realsense"
-    serial: str | None = Field(
+    serial: Text | None = Field(
         default=None, min_length=1, max_length=64, description="Of the camera; not needed if only one is connected."
     )
     width: int = Field(default=848, description="Columns: 424, 480, 640, 848 or 1280.")
@@ -222,9 +225,14 @@ def camera_info(opened: link.Opened, fx_stereo: float | None = None) -> CameraIn
     Raises:
         SourceError: its image is distorted, or is not of a depth camera.
     """
-    if any(opened.distortion):
-        raise SourceError(f"camera {opened.serial}: expected depth without distortion, got {opened.distortion}")
-    return CameraInfo(opened.serial, opened.model, _intrinsics(opened, fx_stereo))
+    intrinsics = _intrinsics(opened, fx_stereo)
+    moved_px = distortion_px(intrinsics, np.array(opened.distortion))
+    if moved_px > DISTORTION_MAX_PX:
+        raise SourceError(
+            f"camera {opened.serial}: expected depth without distortion, got {opened.distortion}, which moves pixels "
+            f"by up to {moved_px:.3g}; let the camera deliver its own depth image, not one aligned to another lens"
+        )
+    return CameraInfo(opened.serial, opened.model, intrinsics)
 
 
 def image_info(opened: link.Opened) -> ImageInfo:
@@ -265,9 +273,6 @@ def _intrinsics(opened: link.Opened, fx_stereo: float | None) -> Intrinsics:
 def _read_joints(path: Path) -> NDArray[np.float64]:
     """Read joint positions (frames, n)."""
     try:
-        rows: NDArray[np.float64] = np.loadtxt(path, delimiter=",", ndmin=2)
+        return parse_numbers(read_text(path))
     except (OSError, ValueError) as error:
-        raise SourceError(f"{path}: expected a row of numbers for each frame: {error}") from error
-    if not np.isfinite(rows).all():
-        raise SourceError(f"{path}: expected finite joint positions, got NaN or infinity")
-    return rows
+        raise SourceError(f"{path}: expected a row of joint positions for each frame: {error}") from error

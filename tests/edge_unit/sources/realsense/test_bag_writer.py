@@ -109,6 +109,6 @@ def test_errors_name_the_file(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"nothing: expected the folder of a recording"):
         record_images(RecordedSourceConfig(folder=tmp_path / "nothing"), tmp_path / "out.db3", FPS)
     (folder / "depth" / "04.png").write_bytes(b"no image")
-    with pytest.raises(SourceError, match=r"04\.png: expected a PNG image"):
+    with pytest.raises(SourceError, match=r"04\.png: expected an image, got another file"):
         record_images(images, tmp_path / "out.db3", FPS)
     assert not (tmp_path / "out.db3").exists()

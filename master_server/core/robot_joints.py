@@ -5,11 +5,10 @@ from __future__ import annotations
 
 from collections import deque
 from itertools import takewhile
-from typing import Literal
 
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.errors import Refusal
-from shared.messages import MAX_JOINT_SAMPLES, JointSample, JointsRequest, Reason
+from shared.messages import MAX_JOINT_SAMPLES, JointSample, JointsRequest, Reason, RobotState
 
 HISTORY_SAMPLES = 2048
 """Four seconds of a robot that reports at 500 Hz; no unit's frame is older when it is still of use."""
@@ -19,8 +18,6 @@ FUTURE_TOLERANCE_NS = 20 * NS_PER_MS
 
 ANSWER_SPACING_NS = 8 * NS_PER_MS
 """At 40 rad/s2, linear interpolation over 8 ms is wrong by 0.3 mrad: denser samples tell a unit nothing more."""
-
-RobotState = Literal["fresh", "stale", "silent", "none"]
 
 
 class RobotJoints:

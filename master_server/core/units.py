@@ -20,6 +20,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.errors import Refusal
 from shared.messages import (
     MAX_COMMANDS,
+    OPEN,
     Command,
     CommandRow,
     Health,
@@ -89,7 +90,7 @@ class UnitState:
 
     id: int
     ip: str
-    state: State
+    state: Annotated[State, OPEN]
     reason: str
     cause: Annotated[Reason | None, Field(description="The reason for programs.")]
     age_s: Annotated[float | None, Field(description="Since the capture of its last frame.")]
@@ -538,9 +539,12 @@ class Registry:
         """Have a unit do something; it learns of it with the answer to its next update. `on_end` is told the outcome.
 
         Raises:
-            Refusal: 409, too many commands wait for it already.
+            Refusal: 409, too many commands wait for it already, or the unit does not understand this master.
         """
         slot.expire(now_ns)
+        health = slot.session.health
+        if health.trouble_code == "contract":
+            raise Refusal(409, f"unit {slot.id}: it takes no commands of this master: {health.trouble}")
         if len(slot.asked) >= MAX_COMMANDS:
             raise Refusal(409, f"unit {slot.id}: {MAX_COMMANDS} commands wait for it already")
         self._last_command += 1

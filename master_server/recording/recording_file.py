@@ -21,7 +21,8 @@ from pydantic import BaseModel
 
 from master_server.recording import foxglove
 from master_server.recording.moment import (
-    FORMAT,
+    FORMAT_MAJOR,
+    FORMAT_MINOR,
     MAP_TOPIC,
     METADATA,
     SEEN_TOPIC,
@@ -80,7 +81,7 @@ class RecordingFile:
         try:
             self._writer = Writer(self._file, chunk_size=NEVER_BYTES)
             self._writer.start()
-            self._writer.add_metadata(METADATA, {"format": str(FORMAT)})
+            self._writer.add_metadata(METADATA, {"format": f"{FORMAT_MAJOR}.{FORMAT_MINOR}"})
             self._channels = {topic: self._json_channel(topic, model) for topic, model in RECORDS.items()}
             self._channels |= {topic: self._picture_channel(topic, kind) for topic, kind in PICTURES.items()}
             self._file.flush()

@@ -31,7 +31,8 @@ from pydantic import BaseModel, ValidationError
 
 from master_server.core import MapView
 from master_server.recording.moment import (
-    FORMAT,
+    FORMAT_MAJOR,
+    FORMAT_MINOR,
     MAP_TOPIC,
     METADATA,
     SEEN_TOPIC,
@@ -61,6 +62,9 @@ PROGRESS_STEP_BYTES = 2**24
 
 UNREADABLE = (McapError, struct.error, ValueError, OverflowError, zstandard.ZstdError)
 """All ways in which the library says that bytes are damaged."""
+
+UNKNOWN_REASON = "the recording says that the map was not complete, and not why"
+"""Reason of a moment that is not complete and has none: absence of a reason must not make it complete."""
 
 Progress = Callable[[int, int], None]
 Model = TypeVar("Model", bound=BaseModel)
@@ -211,8 +215,20 @@ class Recording:
 
     def _begin(self) -> None:
         index = self._index
-        if index.format != str(FORMAT):
-            raise SourceError(f"{self.path}: expected a master's recording of format {FORMAT}, got {index.format}")
+        major, minor = _version(index.format)
+        if major != FORMAT_MAJOR:
+            raise SourceError(
+                f"{self.path}: expected a master's recording of format {FORMAT_MAJOR}.x, got {index.format or 'none'}; "
+                "replay it with the version of Cellwatch that wrote it"
+            )
+        if minor > FORMAT_MINOR:
+            logger.warning(
+                "%s: its format %s is newer than %d.%d; what this version does not know of the status is ignored",
+                self.path,
+                index.format,
+                FORMAT_MAJOR,
+                FORMAT_MINOR,
+            )
         first = next(filter(None, map(self._unpacked, index.chunks)), None)
         last = next(filter(None, map(self._unpacked, reversed(index.chunks))), None)
         if first is None or last is None:
@@ -249,13 +265,13 @@ class Recording:
                 merged.lattice_version,
                 keys,
                 witnesses,
-                state.reasons,
+                state.reasons if state.complete or state.reasons else (UNKNOWN_REASON,),
                 state.oldest_view_age_s,
                 state.units_live,
                 merged.reported(),
                 state.causes,
             )
-            settings = _checked(Settings, raw.settings)
+            settings = _settings(raw.settings)
             return Frame(raw.log_ns, state, view, seen.blocks.lattice(), seen.counts(), settings)
         except InputError as error:
             raise SourceError(f"{self.path}: {error}") from error
@@ -321,6 +337,30 @@ def _frames(records: list[McapRecord], channels: dict[int, Channel]) -> Iterator
         latest[topic] = record.data
         if topic == STATE_TOPIC and {MAP_TOPIC, SEEN_TOPIC, SETTINGS_TOPIC} <= latest.keys():
             yield _RawFrame(record.log_time, record.data, latest[MAP_TOPIC], latest[SEEN_TOPIC], latest[SETTINGS_TOPIC])
+
+
+def _version(text: str | None) -> tuple[int, int]:
+    """Major and minor of a recording's format; (0, 0) if it has none that can be read."""
+    major, _, minor = (text or "").partition(".")
+    numbers = [int(part) if part.isascii() and part.isdigit() else 0 for part in (major, minor or "0")]
+    return numbers[0], numbers[1]
+
+
+def _settings(data: bytes) -> Settings:
+    """The recorded settings, without those of a later minor.
+
+    Raises:
+        InputError: a value that this version knows is wrong.
+    """
+    try:
+        fields = json.loads(data)
+        if isinstance(fields, dict):
+            fields = {name: fields[name] for name in Settings.model_fields if name in fields}
+        return Settings.model_validate(fields)
+    except ValidationError as error:
+        raise InputError(f"Settings: {sentence(error)}") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"Settings: expected JSON: {error}") from error
 
 
 def _checked(model: type[Model], data: bytes) -> Model:

@@ -8,10 +8,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from master_server.api.history import Sample
-from master_server.core.robot_joints import RobotState
 from master_server.recording.replay import ReplayAnswer
 from master_server.viewer.sessions import Viewer
-from shared.messages import LatticeDescription, UnitRow
+from shared.messages import OPEN, LatticeDescription, RobotState, UnitRow
 
 NOT_RECORDED: dict[int, bytes] = {}
 """Of `reports`, where a recording does not tell which unit reports which voxels."""
@@ -94,7 +93,7 @@ class RefusedAnswer(ViewerMessage):
 class RobotStanding(ViewerMessage):
     """Whether units can filter the robot, and why not in words."""
 
-    state: RobotState
+    state: Annotated[RobotState, OPEN]
     reason: str
 
 

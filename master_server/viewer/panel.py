@@ -24,13 +24,13 @@ from master_server.viewer.channel import Asker
 from master_server.viewer.messages import ApiAnswer, ApiRequest, Look
 from master_server.viewer.scene import (
     SHARED_COLOUR,
-    STATE_COLOURS,
     WITNESS_COLOURS,
     Colour,
     RangeLayer,
     UnseenLayer,
     VoxelLayer,
     Voxels,
+    state_colour,
     unit_colour,
 )
 from master_server.viewer.sessions import Viewer
@@ -126,10 +126,10 @@ def table_html(rows: Sequence[UnitRow]) -> str:
     parts = [f"<tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr>"]
     for row in rows:
         health = row.health
-        state = row.state
+        state = html.escape(row.state)
         cells = (
             f"{row.id} · {html.escape(row.ip)}",
-            f'<span style="color:{_css(state)}">⬤</span> <b>{state}</b>',
+            f'<span style="color:{_css(row.state)}">⬤</span> <b>{state}</b>',
             "" if row.age_s is None else f"{row.age_s * 1000:.0f}",
             f"{row.fps:.1f}",
             f"{row.process_ms:.1f}",
@@ -189,7 +189,7 @@ def _progress_html(progress: Progress | None) -> str:
 
 
 def _css(state: str) -> str:
-    return "rgb({}, {}, {})".format(*STATE_COLOURS[state])
+    return "rgb({}, {}, {})".format(*state_colour(state))
 
 
 def _curve(points: list[tuple[int, float]], offset_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -270,7 +270,7 @@ class Scene:
         pyramid = self._server.scene.add_line_segments(
             f"/cameras/{unit_id}",
             view_edges(row.intrinsics, FRUSTUM_M),
-            STATE_COLOURS[state],
+            state_colour(state),
             thickness=FRUSTUM_LINE_M,
             wxyz=wxyz_of(pose),
             position=pose[:3, 3],
@@ -383,6 +383,11 @@ class RangeLayer:
     def hide(self) -> None:
         """Draw it no more."""
         self.show([])
+
+
+def state_colour(state: str) -> Colour:
+    """The colour of a unit's state; a state of a later minor is not live, and has the colour of a blind one."""
+    return STATE_COLOURS.get(state, STATE_COLOURS["blind"])
 
 
 def _range_of(row: UnitRow) -> tuple[float, Matrix, Intrinsics] | None:

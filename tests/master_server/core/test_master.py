@@ -740,3 +740,15 @@ def test_a_row_tells_what_the_camera_is_and_how_far_it_looks() -> None:
     unit.update(NOW_NS, [5], seen=sees_all(one))
     # The highest block of a cell of half a metre, from its floor.
     assert one.units(NOW_NS)[0].range_m == 0.45
+
+
+@pytest.mark.parametrize("verb", ["learn_background", "refine", "calibrate", "image"])
+def test_a_unit_that_does_not_understand_its_master_is_sent_no_command(verb: Verb) -> None:
+    one = master()
+    unit = joined(one)
+    unit.update(NOW_NS, health=Health(trouble="update this unit: it speaks contract 5.0", trouble_code="contract"))
+    with pytest.raises(Refusal, match="takes no commands of this master: update this unit") as refused:
+        one.registry.ask(one.registry.get(unit.initialized.id), verb, NOW_NS)
+    assert refused.value.status == 409
+    unit.update(NOW_NS)
+    assert one.registry.ask(one.registry.get(unit.initialized.id), verb, NOW_NS).verb == verb

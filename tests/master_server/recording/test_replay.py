@@ -16,6 +16,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from master_server.__main__ import main
@@ -24,7 +25,7 @@ from master_server.app import make_app, make_replay_app
 from master_server.core import Master
 from master_server.recording import recording_reader as recorded_module
 from master_server.recording import timeline as timeline_module
-from master_server.recording.moment import StateRecord, moment_of
+from master_server.recording.moment import METADATA, STATE_TOPIC, StateRecord, moment_of
 from master_server.recording.recording_file import RecordingFile
 from master_server.recording.recording_reader import Recording
 from master_server.recording.replay import Replay, ReplayRequest
@@ -247,7 +248,7 @@ import os, signal, sys
 from pathlib import Path
 from tests.master_server.recording.test_replay import WALL_LESS_MONOTONIC_NS, Script
 from master_server.recording.recording_file import RecordingFile
-from master_server.recording.moment import StateRecord, moment_of
+from master_server.recording.moment import METADATA, STATE_TOPIC, StateRecord, moment_of
 script = Script()
 file = RecordingFile(Path(sys.argv[1]), WALL_LESS_MONOTONIC_NS)
 for number in range(36):
@@ -322,7 +323,7 @@ def test_what_is_no_recording_is_named(tmp_path: Path, capsys: pytest.CaptureFix
         ("gone.mcap", "cannot be read: No such file"),
         ("empty.mcap", "it is empty"),
         ("text.mcap", "it is no MCAP file"),
-        ("other.mcap", "expected a master's recording of format 1, got None"),
+        ("other.mcap", "expected a master's recording of format 1.x, got none"),
     ):
         for command in ("recording-info", "replay"):
             assert main([command, str(tmp_path / name)]) == 1
@@ -438,3 +439,93 @@ def test_info_tells_of_all_files(tmp_path: Path, capsys: pytest.CaptureFixture[s
     out = capsys.readouterr().out
     assert all(str(path) in out for path in paths)
     assert "(3.9 s)" in out
+
+
+def rewritten(path: Path, target: Path, version: str, change: Callable[[str, dict[str, Any]], None]) -> Path:
+    """Write a recording again, as another version would: each JSON message after `change(topic, fields)`."""
+    with path.open("rb") as source, target.open("wb") as out:
+        reader = make_reader(source)
+        writer = Writer(out)
+        writer.start("", "")
+        writer.add_metadata(METADATA, {"format": version})
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            if channel.id not in channels:
+                assert schema is not None
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, schema_id)
+            data = message.data
+            if channel.topic.startswith("/cellwatch/"):
+                fields = json.loads(data)
+                change(channel.topic, fields)
+                data = json.dumps(fields).encode()
+            writer.add_message(channels[channel.id], message.log_time, data, message.publish_time, message.sequence)
+        for attachment in reader.iter_attachments():
+            writer.add_attachment(
+                attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
+            )
+        writer.finish()
+    return target
+
+
+def of_a_later_minor(topic: str, fields: dict[str, Any]) -> None:
+    fields["weather"] = "fog"
+    if topic == STATE_TOPIC:
+        fields["causes"] = [{"code": "fogged", "sentence": "unit 1 is fogged", "numbers": {}}]
+        fields["reasons"], fields["complete"] = ["unit 1 is fogged"], False
+        fields["robot"] |= {"state": "drifting", "drift_rad": 0.1}
+        for unit in fields["units"]:
+            unit |= {"state": "dozing", "mood": "good"}
+            unit["health"] |= {"trouble_code": "fogged", "humidity": 0.9}
+
+
+def test_a_recording_of_a_later_minor_plays_without_what_is_unknown(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    record(tmp_path / "now.mcap")
+    later = rewritten(tmp_path / "now.mcap", tmp_path / "later.mcap", "1.99", of_a_later_minor)
+    with Recording(later) as recording, Recording(tmp_path / "now.mcap") as own:
+        frame, same = recording.at(recording.begin_ns), own.at(own.begin_ns)
+    assert "its format 1.99 is newer than 1.1" in caplog.text
+    assert frame.settings == same.settings
+    np.testing.assert_array_equal(frame.view.keys, same.view.keys)
+    assert not frame.view.complete
+    assert [cause.code for cause in frame.view.causes] == ["fogged"]
+    assert {unit.state for unit in frame.state.units} == {"dozing"}
+    assert (frame.state.robot.state, frame.state.units[0].health.trouble_code) == ("drifting", "fogged")
+
+
+def test_a_recording_of_the_first_format_plays(tmp_path: Path) -> None:
+    def of_1_0(topic: str, fields: dict[str, Any]) -> None:
+        fields.pop("causes", None)
+        fields.pop("reports", None)
+        for unit in fields.get("units", ()):
+            for name in ("cause", "contract_minor"):
+                unit.pop(name, None)
+
+    record(tmp_path / "now.mcap")
+    first = rewritten(tmp_path / "now.mcap", tmp_path / "first.mcap", "1", of_1_0)
+    with Recording(first) as recording, Recording(tmp_path / "now.mcap") as own:
+        frame, same = recording.at(recording.begin_ns), own.at(own.begin_ns)
+        assert frame.view.reasons == same.view.reasons
+        np.testing.assert_array_equal(frame.view.keys, same.view.keys)
+
+
+def test_a_moment_that_is_not_complete_and_says_not_why_is_not_complete(tmp_path: Path) -> None:
+    def silent(topic: str, fields: dict[str, Any]) -> None:
+        if topic == STATE_TOPIC:
+            fields |= {"complete": False, "reasons": [], "causes": []}
+
+    record(tmp_path / "now.mcap")
+    with Recording(rewritten(tmp_path / "now.mcap", tmp_path / "silent.mcap", "1.1", silent)) as recording:
+        view = recording.at(recording.end_ns).view
+    assert not view.complete
+    assert view.reasons
+
+
+@pytest.mark.parametrize("version", ["2", "2.0", "0.9", "", "one"])
+def test_a_recording_of_another_major_is_refused_in_one_sentence(tmp_path: Path, version: str) -> None:
+    record(tmp_path / "now.mcap")
+    other = rewritten(tmp_path / "now.mcap", tmp_path / "other.mcap", version, lambda topic, fields: None)
+    with pytest.raises(SourceError, match=rf"other\.mcap: expected a master's recording of format 1\.x, got {version}"):
+        Recording(other)

@@ -186,7 +186,7 @@ class Bench:
 
     def ask(self, verb: Verb) -> Command:
         """Ask unit 1 for something, as an operator does."""
-        return self.master.ask(1, verb, self.unit_clock.now_ns())
+        return self.master.send_command(1, verb, self.unit_clock.now_ns())
 
     async def until(self, look: Callable[[], Any], what: str, *, beating: bool = False) -> Any:
         """Wait until threads and requests have come so far that `look` finds something.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Listeners without a network, by a clock that goes on only when it is told to."""
+"""Listeners without a network, with a clock that the test advances."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from master_server.api.map_stream import (
     PERIOD_MIN_NS,
     Listener,
     Stream,
-    Wish,
+    StreamFormat,
 )
 from master_server.api.responses import StreamMessage
 from master_server.core import Master
@@ -29,10 +29,10 @@ from shared.waiting import within
 from tests.master_server.fakes import MS, START_NS, FakeUnit, joined, master, sees_all
 from tests.set_clock import SetClock
 
-KEYS = Wish("keys")
+KEYS = StreamFormat("keys")
 
 PATIENCE_S = 10.0
-"""For what has to come at once on a quiet machine; by the real clock, and so never measured."""
+"""Timeout for a message that comes at once on an idle machine; by the real clock, so no test measures it."""
 
 
 @pytest.fixture
@@ -41,19 +41,19 @@ def clock() -> SetClock:
 
 
 @pytest.fixture(autouse=True)
-def pictures_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a busy machine the stream rests longer after a picture; how long, one test sets by itself."""
+def snapshots_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make snapshots cost nothing: on a busy machine the stream pauses longer after one. One test sets its own cost."""
     monkeypatch.setattr(stream_module, "stage_ns", lambda: 0)
 
 
 @pytest.fixture
 def robotic() -> Master:
-    """A master of a cell with a robot; it reads files, so not in a loop."""
+    """Return a master of a cell with a robot; it reads files, so outside of an event loop."""
     return master(with_robot=True, robot_stale_after_s=0.4)
 
 
 async def heard(listener: Listener) -> dict[str, Any]:
-    """The message that is there for the listener."""
+    """Return the listener's waiting message."""
     messages: list[bytes | str] = []
 
     async def take() -> None:
@@ -67,7 +67,7 @@ async def heard(listener: Listener) -> dict[str, Any]:
 
 
 async def next_heard(clock: SetClock, listener: Listener) -> dict[str, Any]:
-    """The message that the next call of the clock makes."""
+    """Return the message of the clock's next call."""
     at_ns = clock.step()
     message = await heard(listener)
     assert message["now_ns"] == at_ns
@@ -98,7 +98,7 @@ async def test_the_first_message_comes_at_once_and_each_change_after_it(clock: S
     assert len(stream) == 0
 
 
-async def test_what_an_operator_and_the_robot_do_is_told_too(robotic: Master, clock: SetClock) -> None:
+async def test_changes_by_an_operator_and_the_robot_are_sent_too(robotic: Master, clock: SetClock) -> None:
     unit = live(robotic, 1, 5)
     with Stream(robotic, clock).listen(KEYS) as listener:
         assert (await next_heard(clock, listener))["reasons"] == ["the robot has not reported its joints yet"]
@@ -114,7 +114,7 @@ async def test_what_an_operator_and_the_robot_do_is_told_too(robotic: Master, cl
 
 
 @pytest.mark.parametrize("stale_after_s", [0.06, 0.3])
-async def test_a_unit_that_falls_silent_is_told_at_its_moment(stale_after_s: float, clock: SetClock) -> None:
+async def test_a_stale_unit_is_sent_when_it_becomes_stale(stale_after_s: float, clock: SetClock) -> None:
     one = master(stale_after_s=stale_after_s)
     stream = Stream(one, clock)
     live(one, 1, 5)
@@ -128,7 +128,7 @@ async def test_a_unit_that_falls_silent_is_told_at_its_moment(stale_after_s: flo
         assert message["units"][0]["state"] == "stale"
 
 
-async def test_a_robot_that_falls_silent_is_told_at_its_moment(robotic: Master, clock: SetClock) -> None:
+async def test_a_stale_robot_is_sent_when_it_becomes_stale(robotic: Master, clock: SetClock) -> None:
     robotic.change_settings({"stale_after_s": 60.0})
     live(robotic, 1, 5)
     robotic.put_joints(JointsRequest(positions=(0.0, 0.0)), START_NS)
@@ -147,7 +147,7 @@ async def test_without_any_change_there_is_a_heartbeat(clock: SetClock) -> None:
         assert second["reasons"] == ["there is no unit"]
 
 
-async def test_the_timer_rests_while_nobody_listens(clock: SetClock) -> None:
+async def test_the_timer_is_idle_without_listeners(clock: SetClock) -> None:
     one = master()
     unit = live(one)
     stream = Stream(one, clock)
@@ -156,7 +156,7 @@ async def test_the_timer_rests_while_nobody_listens(clock: SetClock) -> None:
         await next_heard(clock, listener)
     clock.step()
     unit.update(clock.now, [1], age_ns=MS)
-    assert stream.picture is None
+    assert stream.snapshot is None
     assert clock.due_ns() is None
     with stream.listen(KEYS) as listener:
         assert (await next_heard(clock, listener))["voxels"] == [1]
@@ -179,7 +179,7 @@ async def test_many_updates_make_few_messages(clock: SetClock) -> None:
         assert listener.skipped == 0
 
 
-async def test_who_comes_late_has_the_newest_and_the_others_missed_nothing(clock: SetClock) -> None:
+async def test_a_late_listener_gets_the_newest_and_the_others_miss_nothing(clock: SetClock) -> None:
     one = master()
     unit = live(one)
     stream = Stream(one, clock)
@@ -195,7 +195,7 @@ async def test_who_comes_late_has_the_newest_and_the_others_missed_nothing(clock
         assert (quick.sent, slow.sent) == (6, 2)
 
 
-async def test_listeners_of_one_wish_share_one_encoding(monkeypatch: pytest.MonkeyPatch, clock: SetClock) -> None:
+async def test_listeners_of_one_format_share_one_encoding(monkeypatch: pytest.MonkeyPatch, clock: SetClock) -> None:
     encoded: list[str] = []
     original = stream_module.map_fields
 
@@ -207,7 +207,10 @@ async def test_listeners_of_one_wish_share_one_encoding(monkeypatch: pytest.Monk
     one = master()
     live(one, 1, 411)
     stream = Stream(one, clock)
-    listeners = [stream.listen(wish) for wish in (KEYS, KEYS, KEYS, Wish("centres"), Wish("keys", "json"))]
+    listeners = [
+        stream.listen(stream_format)
+        for stream_format in (KEYS, KEYS, KEYS, StreamFormat("centres"), StreamFormat("keys", "json"))
+    ]
     clock.step()
     messages = [await listener.next() for listener in listeners]
     assert messages[0] is messages[1] is messages[2]
@@ -216,17 +219,17 @@ async def test_listeners_of_one_wish_share_one_encoding(monkeypatch: pytest.Monk
     assert isinstance(messages[4], str)
 
 
-async def test_unseen_blocks_only_for_who_wants_them(clock: SetClock) -> None:
+async def test_unseen_blocks_are_sent_only_on_request(clock: SetClock) -> None:
     one = master()
     joined(one, 1).update(START_NS, age_ns=MS)
     stream = Stream(one, clock)
-    with stream.listen(KEYS) as without, stream.listen(Wish("keys", unseen=True)) as with_unseen:
+    with stream.listen(KEYS) as without, stream.listen(StreamFormat("keys", unseen=True)) as with_unseen:
         clock.step()
         assert (await heard(without))["unseen"] is None
         assert len((await heard(with_unseen))["unseen"]["blocks"]) == 10 * 20 * 5
 
 
-async def test_there_is_an_end_to_listeners(clock: SetClock) -> None:
+async def test_the_number_of_listeners_is_bounded(clock: SetClock) -> None:
     stream = Stream(master(), clock)
     listeners = [stream.listen(KEYS) for _ in range(MAX_LISTENERS)]
     with pytest.raises(Refusal, match=str(MAX_LISTENERS)) as caught:
@@ -236,7 +239,7 @@ async def test_there_is_an_end_to_listeners(clock: SetClock) -> None:
     stream.listen(KEYS)
 
 
-async def test_a_fault_costs_one_picture(monkeypatch: pytest.MonkeyPatch, clock: SetClock) -> None:
+async def test_a_fault_costs_one_snapshot(monkeypatch: pytest.MonkeyPatch, clock: SetClock) -> None:
     one = master()
 
     def faulty(now_ns: int) -> Any:
@@ -250,7 +253,7 @@ async def test_a_fault_costs_one_picture(monkeypatch: pytest.MonkeyPatch, clock:
         assert (await next_heard(clock, listener))["units_live"] == 0
 
 
-async def test_what_costs_much_comes_rarely_but_with_each_heartbeat(
+async def test_costly_snapshots_are_rare_but_keep_the_heartbeat(
     monkeypatch: pytest.MonkeyPatch, clock: SetClock
 ) -> None:
     ticks = itertools.count(0, MS)

@@ -17,13 +17,13 @@ from shared.errors import InputError
 Transform: TypeAlias = NDArray[np.float64]
 
 ROTATION_TOLERANCE = 2e-3
-"""How far `R @ R.T` may be from the identity: three decimals of each number leave it off by up to 1.7e-3."""
+"""Largest deviation of `R @ R.T` from the identity; three decimals of each number leave it off by up to 1.7e-3."""
 
 EXACT = 1e-12
-"""A rotation that is orthonormal as far as this is left as it is, digit by digit."""
+"""A rotation with a smaller deviation stays as it is, digit by digit."""
 
 NOTABLE_ROUNDING = 1e-5
-"""A rotation that was off by more had fewer than five decimals: points at 3 m are off by up to 0.05 mm and more."""
+"""A rotation with a larger correction had fewer than five decimals; points at 3 m are off by 0.05 mm or more."""
 
 LAST_ROW_TOLERANCE = 1e-6
 """Largest deviation of the last row from 0 0 0 1; products and inverses in float32 are off by about 1e-7."""

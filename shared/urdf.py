@@ -41,7 +41,7 @@ JointKind = Literal["revolute", "continuous", "prismatic", "fixed"]
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed")
 
 QUATERNION_TOLERANCE = 1e-3
-"""How far the length of a quaternion may be from 1: three decimals of each number leave it off by less."""
+"""Largest deviation of a quaternion's length from 1; three decimals of each number leave it off by less."""
 
 NAMES_SHOWN = 10
 """Of links or files in one message; a robot without any mesh file would fill a screen."""

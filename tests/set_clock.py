@@ -42,7 +42,7 @@ class SetClock:
         return self.timers[-1]
 
     def due_ns(self) -> int | None:
-        """When the next call is due; None when none is."""
+        """Time of the next scheduled call; None if there is none."""
         self.timers = [timer for timer in self.timers if not timer.cancelled]
         return min((timer.at_ns for timer in self.timers), default=None)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tests of the pipeline look at: cameras, small cells, and true depth by casting rays."""
+"""Scenes of the pipeline's tests: cameras, small cells, and true depth by casting rays."""
 
 from __future__ import annotations
 

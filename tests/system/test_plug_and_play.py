@@ -16,7 +16,7 @@ from tests.missing import need_namespaces
 pytestmark = pytest.mark.slow
 
 BUSY_S = 1.0
-"""What other tests beside may add to a time that is not bound by computing."""
+"""Time that other tests beside may add to one that is not bound by computing."""
 
 BUSY_START = 5.0
 """A start is mostly computing; beside other tests it takes so many times as long."""

@@ -586,7 +586,7 @@ async def test_the_background_is_learned_kept_and_used_again(tmp_path: Path) -> 
 
 
 async def outcome_of(bench: Bench, verb: Verb) -> CommandRow:
-    """What becomes of a command that the next frame answers."""
+    """Outcome of a command that the next frame answers."""
     command = await bench.ask_and_hear(verb)
     bench.show(patch(1225))
     row = await bench.until(

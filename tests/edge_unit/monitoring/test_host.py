@@ -31,7 +31,7 @@ def test_cameras_on_usb_with_their_speed(tmp_path: Path) -> None:
 
 
 TIME_ERROR = 5
-"""What adjtimex(2) returns of a clock that nobody keeps right, whatever its structure says; less is right."""
+"""Return value of adjtimex(2) for a clock that nothing synchronises; smaller values mean a synchronised clock."""
 
 
 def test_the_kernel_reports_the_state_of_its_clock() -> None:

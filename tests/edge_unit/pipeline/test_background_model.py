@@ -37,12 +37,12 @@ NO_ROBOT = np.full(CAMERA.shape, 65535, np.uint16), np.zeros(CAMERA.shape, np.ui
 
 ROOM = (placed("ground", box_mesh("ground", (12.0, 12.0, 0.02)), (0, 0, -0.01)),
         placed("bench", box_mesh("bench", (0.5, 0.4, 0.5)), (-0.5, 0.4, 0.25)))  # fmt: skip
-"""What stands in the empty cell and in no model."""
+"""Things that stand in the empty cell and in no model."""
 
 PERSON = placed("person", cylinder_mesh("person", 0.12, 1.2), (0.4, -0.3, 0.6))
 
 COLUMN = np.isfinite(raycast(bodies(small_cell(floor=False), [0.0])[:1], OVERHEAD, CAMERA))
-"""Where the camera sees the robot's fixed link."""
+"""Pixels at which the camera sees the robot's fixed link."""
 
 
 def look(*things: PlacedMesh, joints: float | None = None, noise: np.random.Generator | None = None) -> Depth:

@@ -29,7 +29,7 @@ Change = Callable[[NDArray[np.uint32]], NDArray[np.uint32]]
 
 
 class Recorded:
-    """What two units saw and reported; the reports may be changed before they are written."""
+    """Truth and reports of two units; the reports may be changed before they are written."""
 
     def __init__(self, folder: Path) -> None:
         self.settings = FilterSettings()

@@ -16,11 +16,11 @@ WIDTH, HEIGHT, FPS = 424, 240, 30
 DEPTH_SCALE_M, BASELINE_M = 0.0005, 0.055
 FX, FY, CX, CY = 212.5, 211.5, WIDTH / 2 + 0.25, HEIGHT / 2 - 0.25
 COLOR_AT_M = (0.015, 0.0, 0.001)
-"""Where the colour camera stands in the depth camera's frame; the infrared imager is where depth is."""
+"""Place of the colour camera in the depth camera's frame; the infrared imager is at the origin of depth."""
 
 
 def depth_of(number: int, width: int = WIDTH, height: int = HEIGHT) -> NDArray[np.uint16]:
-    """What frame `number` shows: its number, but for a first row that counts columns."""
+    """Depth image of frame `number`: its number everywhere, but a first row that counts columns."""
     depth = np.full((height, width), number, np.uint16)
     depth[0] = np.arange(width)
     return depth

@@ -757,7 +757,7 @@ async def test_pictures_are_drawn_when_someone_asks(tmp_path: Path) -> None:
         coloured = await picture(client, "expected")
         assert cv2.imdecode(np.frombuffer(coloured.content, np.uint8), cv2.IMREAD_UNCHANGED).shape == (48, 64, 3)
         await bench.until_state("live")
-        await bench.until(lambda: not bench.master.registry.get(1).asked, "all told", beating=True)
+        await bench.until(lambda: not bench.master.registry.get(1).pending, "all told", beating=True)
 
 
 BOARD = Board("grid", 3, 4, 0.08, 0.06, "DICT_4X4_50", 0, from_xyz_rpy((0.4, 1.1, 0.0), (np.pi, 0.0, 0.0)))

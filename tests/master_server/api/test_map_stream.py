@@ -52,7 +52,7 @@ def robotic() -> Master:
     return master(with_robot=True, robot_stale_after_s=0.4)
 
 
-async def heard(listener: Listener) -> dict[str, Any]:
+async def received(listener: Listener) -> dict[str, Any]:
     """Return the listener's waiting message."""
     messages: list[bytes | str] = []
 
@@ -66,10 +66,10 @@ async def heard(listener: Listener) -> dict[str, Any]:
     return found
 
 
-async def next_heard(clock: SetClock, listener: Listener) -> dict[str, Any]:
+async def next_received(clock: SetClock, listener: Listener) -> dict[str, Any]:
     """Return the message of the clock's next call."""
     at_ns = clock.step()
-    message = await heard(listener)
+    message = await received(listener)
     assert message["now_ns"] == at_ns
     return message
 
@@ -85,13 +85,13 @@ async def test_the_first_message_comes_at_once_and_each_change_after_it(clock: S
     unit = live(one, 1, 5)
     stream = Stream(one, clock)
     with stream.listen(KEYS) as listener:
-        first = await next_heard(clock, listener)
+        first = await next_received(clock, listener)
         assert first["now_ns"] == START_NS
         assert (first["voxels"], first["witnesses"], first["complete"]) == ([5], [1], True)
         assert [(row["id"], row["state"], row["voxels"]) for row in first["units"]] == [(1, "live", 1)]
         clock.go_to(START_NS + 2 * PERIOD_MIN_NS)
         unit.update(clock.now, [6, 7], age_ns=MS)
-        second = await next_heard(clock, listener)
+        second = await next_received(clock, listener)
         assert second["now_ns"] == START_NS + 2 * PERIOD_MIN_NS
         assert second["voxels"] == [6, 7]
         assert second["number"] == first["number"] + 1
@@ -101,15 +101,15 @@ async def test_the_first_message_comes_at_once_and_each_change_after_it(clock: S
 async def test_changes_by_an_operator_and_the_robot_are_sent_too(robotic: Master, clock: SetClock) -> None:
     unit = live(robotic, 1, 5)
     with Stream(robotic, clock).listen(KEYS) as listener:
-        assert (await next_heard(clock, listener))["reasons"] == ["the robot has not reported its joints yet"]
+        assert (await next_received(clock, listener))["reasons"] == ["the robot has not reported its joints yet"]
         robotic.put_joints(JointsRequest(positions=(0.0, 0.0)), clock.now)
-        assert (await next_heard(clock, listener))["complete"]
+        assert (await next_received(clock, listener))["complete"]
         robotic.change_settings({"voxel_size_m": 0.1})
-        changed = await next_heard(clock, listener)
+        changed = await next_received(clock, listener)
         assert changed["lattice"]["voxel_size_m"] == 0.1
         assert changed["voxels"] == []
         robotic.forget(unit.initialized.id)
-        assert (await next_heard(clock, listener))["units"] == []
+        assert (await next_received(clock, listener))["units"] == []
         assert clock.now == START_NS + 3 * PERIOD_MIN_NS
 
 
@@ -119,8 +119,8 @@ async def test_a_stale_unit_is_sent_when_it_becomes_stale(stale_after_s: float, 
     stream = Stream(one, clock)
     live(one, 1, 5)
     with stream.listen(KEYS) as listener:
-        assert (await next_heard(clock, listener))["complete"]
-        message = await next_heard(clock, listener)
+        assert (await next_received(clock, listener))["complete"]
+        message = await next_received(clock, listener)
         # Its frame was captured 1 ms before the start.
         assert message["now_ns"] == START_NS - MS + round(stale_after_s * NS_PER_S) + DUE_SLACK_NS
         assert not message["complete"]
@@ -133,15 +133,15 @@ async def test_a_stale_robot_is_sent_when_it_becomes_stale(robotic: Master, cloc
     live(robotic, 1, 5)
     robotic.put_joints(JointsRequest(positions=(0.0, 0.0)), START_NS)
     with Stream(robotic, clock).listen(KEYS) as listener:
-        assert (await next_heard(clock, listener))["complete"]
-        message = await next_heard(clock, listener)
+        assert (await next_received(clock, listener))["complete"]
+        message = await next_received(clock, listener)
         assert not message["complete"]
         assert message["now_ns"] == START_NS + 400 * MS + DUE_SLACK_NS
 
 
 async def test_without_any_change_there_is_a_heartbeat(clock: SetClock) -> None:
     with Stream(master(), clock).listen(KEYS) as listener:
-        first, second = await next_heard(clock, listener), await next_heard(clock, listener)
+        first, second = await next_received(clock, listener), await next_received(clock, listener)
         assert second["number"] == first["number"] + 1
         assert second["now_ns"] - first["now_ns"] == HEARTBEAT_NS
         assert second["reasons"] == ["there is no unit"]
@@ -153,13 +153,13 @@ async def test_the_timer_is_idle_without_listeners(clock: SetClock) -> None:
     stream = Stream(one, clock)
     assert clock.due_ns() is None
     with stream.listen(KEYS) as listener:
-        await next_heard(clock, listener)
+        await next_received(clock, listener)
     clock.step()
     unit.update(clock.now, [1], age_ns=MS)
     assert stream.snapshot is None
     assert clock.due_ns() is None
     with stream.listen(KEYS) as listener:
-        assert (await next_heard(clock, listener))["voxels"] == [1]
+        assert (await next_received(clock, listener))["voxels"] == [1]
         stream.stop()
         assert clock.due_ns() is None
 
@@ -168,11 +168,11 @@ async def test_many_updates_make_few_messages(clock: SetClock) -> None:
     one = master()
     unit = live(one)
     with Stream(one, clock).listen(KEYS) as listener:
-        times_ns = [(await next_heard(clock, listener))["now_ns"]]
+        times_ns = [(await next_received(clock, listener))["now_ns"]]
         for _ in range(5):
             for key in range(20):
                 unit.update(clock.now, [key], age_ns=MS)
-            message = await next_heard(clock, listener)
+            message = await next_received(clock, listener)
             assert message["voxels"] == [19]
             times_ns.append(message["now_ns"])
         assert times_ns == [START_NS + number * PERIOD_MIN_NS for number in range(6)]
@@ -185,12 +185,12 @@ async def test_a_late_listener_gets_the_newest_and_the_others_miss_nothing(clock
     stream = Stream(one, clock)
     with stream.listen(KEYS) as slow, stream.listen(KEYS) as quick:
         clock.step()
-        await heard(slow)
-        await heard(quick)
+        await received(slow)
+        await received(quick)
         for key in range(1, 6):
             unit.update(clock.now, [key], age_ns=MS)
-            assert (await next_heard(clock, quick))["voxels"] == [key]
-        assert (await heard(slow))["voxels"] == [5]
+            assert (await next_received(clock, quick))["voxels"] == [key]
+        assert (await received(slow))["voxels"] == [5]
         assert (quick.skipped, slow.skipped) == (0, 4)
         assert (quick.sent, slow.sent) == (6, 2)
 
@@ -225,8 +225,8 @@ async def test_unseen_blocks_are_sent_only_on_request(clock: SetClock) -> None:
     stream = Stream(one, clock)
     with stream.listen(KEYS) as without, stream.listen(StreamFormat("keys", unseen=True)) as with_unseen:
         clock.step()
-        assert (await heard(without))["unseen"] is None
-        assert len((await heard(with_unseen))["unseen"]["blocks"]) == 10 * 20 * 5
+        assert (await received(without))["unseen"] is None
+        assert len((await received(with_unseen))["unseen"]["blocks"]) == 10 * 20 * 5
 
 
 async def test_the_number_of_listeners_is_bounded(clock: SetClock) -> None:
@@ -250,7 +250,7 @@ async def test_a_fault_costs_one_snapshot(monkeypatch: pytest.MonkeyPatch, clock
             patch.setattr(one, "view", faulty)
             with pytest.raises(RuntimeError, match="once"):
                 clock.step()
-        assert (await next_heard(clock, listener))["units_live"] == 0
+        assert (await next_received(clock, listener))["units_live"] == 0
 
 
 async def test_costly_snapshots_are_rare_but_keep_the_heartbeat(
@@ -262,15 +262,15 @@ async def test_costly_snapshots_are_rare_but_keep_the_heartbeat(
     one = master(stale_after_s=60.0)
     unit = live(one, 1, 1)
     with Stream(one, clock).listen(KEYS) as listener:
-        first = await next_heard(clock, listener)
+        first = await next_received(clock, listener)
         unit.update(clock.now, [2], age_ns=MS)
-        second = await next_heard(clock, listener)
+        second = await next_received(clock, listener)
         assert second["voxels"] == [2]
         assert second["now_ns"] - first["now_ns"] == HEARTBEAT_NS
 
 
 async def test_by_default_its_clock_is_the_machine_s() -> None:
     with Stream(master()).listen(KEYS) as listener:
-        first, second = await heard(listener), await heard(listener)
+        first, second = await received(listener), await received(listener)
         assert second["now_ns"] - first["now_ns"] >= HEARTBEAT_NS - MS
         assert asyncio.get_running_loop().is_running()

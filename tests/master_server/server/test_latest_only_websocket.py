@@ -67,7 +67,7 @@ async def serving(access: Access | None = None, **options: Any) -> AsyncIterator
             await task
 
 
-async def heard(connection: ClientConnection) -> dict[str, Any]:
+async def received(connection: ClientConnection) -> dict[str, Any]:
     message = await connection.recv()
     found: dict[str, Any] = msgpack.unpackb(message) if isinstance(message, bytes) else json.loads(message)
     return found
@@ -91,11 +91,11 @@ async def refused(place: Place, query: str = "", token: str | None = UNIT, **mor
 
 async def test_a_reader_receives_the_map_as_it_changes() -> None:
     async with serving() as place, place.connect("?form=keys") as reader:
-        assert (await heard(reader))["reasons"] == ["there is no unit"]
+        assert (await received(reader))["reasons"] == ["there is no unit"]
         joined(place.master, 1, monotonic_ns()).update(monotonic_ns(), [3, 5], seen=sees_all(place.master), age_ns=MS)
-        message = await heard(reader)
+        message = await received(reader)
         while not message["complete"]:
-            message = await heard(reader)
+            message = await received(reader)
         assert message["voxels"] == [3, 5]
 
 
@@ -111,7 +111,7 @@ async def test_a_browser_offers_its_token_as_a_subprotocol_and_does_not_get_it_b
     async with serving() as place:
         async with place.connect("", None, subprotocols=["cellwatch", f"bearer.{token}"]) as reader:
             assert reader.subprotocol == "cellwatch"
-            await heard(reader)
+            await received(reader)
         async with place.connect("", None, subprotocols=[f"bearer.{token}"]) as reader:
             assert reader.subprotocol is None
         assert (await refused(place, "", None, subprotocols=["cellwatch", "bearer.wrong-token-0123456789"]))[0] == 401
@@ -135,7 +135,7 @@ async def test_a_refused_reader_receives_the_reason() -> None:
 async def test_public_reads_need_no_token() -> None:
     access = Access(UNIT.encode(), OPERATOR.encode(), public_reads=True)
     async with serving(access) as place, place.connect("", None) as reader:
-        await heard(reader)
+        await received(reader)
 
 
 async def test_the_number_of_readers_is_bounded_and_a_closed_one_frees_its_place() -> None:
@@ -145,7 +145,7 @@ async def test_the_number_of_readers_is_bounded_and_a_closed_one_frees_its_place
         for reader in readers:
             await reader.close()
         async with place.connect() as reader:
-            await heard(reader)
+            await received(reader)
             assert len(place.stream) == 1
 
 
@@ -155,11 +155,11 @@ async def test_messages_of_a_reader_are_ignored_unless_too_large() -> None:
             await reader.send("hello")
             await reader.send(b"\0" * 100)
             for _ in range(3):
-                await heard(reader)
+                await received(reader)
             await reader.send("x" * (MESSAGE_MAX_BYTES + 1))
             assert await closing_code(reader) == 1009
         async with place.connect() as reader:
-            await heard(reader)
+            await received(reader)
 
 
 @asynccontextmanager
@@ -187,7 +187,7 @@ async def test_a_reader_that_does_not_read_holds_one_message_and_delays_nobody()
         for step in range(60):
             unit.update(monotonic_ns(), range(2000 + step), age_ns=MS)
             changed_ns = monotonic_ns()
-            while len((await heard(reader))["voxels"]) != 2000 + step:
+            while len((await received(reader))["voxels"]) != 2000 + step:
                 pass
             delays_ns.append(monotonic_ns() - changed_ns)
         idle = min(place.stream.listeners, key=lambda listener: listener.sent)
@@ -214,7 +214,7 @@ async def test_a_reader_that_answers_no_pings_is_disconnected() -> None:
 async def test_a_stopping_master_closes_its_streams() -> None:
     async with serving() as place:
         reader = await place.connect()
-        await heard(reader)
+        await received(reader)
     assert await closing_code(reader) == 1012
 
 
@@ -222,18 +222,18 @@ async def test_a_stream_ends_with_the_token_that_it_was_opened_with() -> None:
     access = Access(UNIT.encode(), OPERATOR.encode())
     new = "another-token-0123456789"
     async with serving(access) as place, place.connect() as first, place.connect(token=OPERATOR) as other:
-        await heard(first)
+        await received(first)
         began_ns = monotonic_ns()
         access.replace(Role.UNIT, new.encode())
         assert await closing_code(first) == TOKEN_REPLACED == 1008
         assert first.close_reason == "the token was replaced"
         assert monotonic_ns() - began_ns < CLOSE_S * NS_PER_S
         assert len(place.stream) == 1
-        await heard(other)
-        await heard(other)
+        await received(other)
+        await received(other)
         assert (await refused(place))[0] == 401
         async with place.connect(token=new) as again:
-            await heard(again)
+            await received(again)
 
 
 async def test_a_viewer_connection_ends_with_its_token_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -262,10 +262,10 @@ async def test_a_viewer_connection_ends_with_its_token_too(monkeypatch: pytest.M
 async def test_a_public_stream_outlives_every_token() -> None:
     access = Access(UNIT.encode(), OPERATOR.encode(), public_reads=True)
     async with serving(access) as place, place.connect() as reader:
-        await heard(reader)
+        await received(reader)
         access.replace(Role.UNIT, b"another-token-0123456789")
         for _ in range(3):
-            await heard(reader)
+            await received(reader)
 
 
 async def test_a_reader_that_does_not_read_is_disconnected_with_its_token_too() -> None:

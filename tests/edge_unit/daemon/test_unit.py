@@ -188,7 +188,7 @@ class Bench:
 
     def ask(self, verb: Verb) -> Command:
         """Ask unit 1 for something, as an operator does."""
-        return self.master.ask(1, verb, self.unit_clock.now_ns())
+        return self.master.send_command(1, verb, self.unit_clock.now_ns())
 
     async def until(self, look: Callable[[], Any], what: str, *, beating: bool = False) -> Any:
         """Wait until threads and requests have come so far that `look` finds something.
@@ -762,7 +762,7 @@ async def test_images_are_drawn_on_request(tmp_path: Path, monkeypatch: pytest.M
         coloured = await picture(client, "expected")
         assert cv2.imdecode(np.frombuffer(coloured.content, np.uint8), cv2.IMREAD_UNCHANGED).shape == (48, 64, 3)
         await bench.until_state("live")
-        await bench.until(lambda: not bench.master.registry.get(1).asked, "all told", beating=True)
+        await bench.until(lambda: not bench.master.registry.get(1).pending, "all told", beating=True)
 
 
 BOARD = Board("grid", 3, 4, 0.08, 0.06, "DICT_4X4_50", 0, from_xyz_rpy((0.4, 1.1, 0.0), (np.pi, 0.0, 0.0)))

@@ -68,7 +68,7 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """In place of the one clock, wherever a route reads it."""
+    """Replace the clock wherever a route reads it."""
     clock = Clock()
     for module in (map, units, robot, replay):
         monkeypatch.setattr(module, "monotonic_ns", clock)
@@ -92,7 +92,7 @@ class Script:
             unit.initialize(START_NS)
 
     def step(self, number: int) -> int:
-        """Do what happens then; returns when it is over."""
+        """Run this step; return its end time."""
         now_ns = START_NS + S + number * STEP_NS
         self.master.put_joints(JointsRequest(positions=(0.01 * number, 0.5), velocities=(0.1, 0.0)), now_ns)
         if number == 20:
@@ -137,7 +137,7 @@ async def answers(app: Any) -> dict[str, Any]:
     return found
 
 
-def test_every_answer_is_as_it_was(tmp_path: Path, clock: Clock) -> None:
+def test_every_answer_equals_the_recorded_one(tmp_path: Path, clock: Clock) -> None:
     script = Script()
     app = make_app(script.master, ACCESS)
     file = RecordingFile(tmp_path / "a.mcap", WALL_LESS_MONOTONIC_NS)
@@ -149,7 +149,7 @@ def test_every_answer_is_as_it_was(tmp_path: Path, clock: Clock) -> None:
             then[number] = asyncio.run(answers(app))
     file.close()
     reasons = {tuple(found["/voxels?unseen=true"]["reasons"]) for found in then.values()}
-    # What is compared must differ between the times.
+    # The compared answers must differ between the times.
     assert len(reasons) >= 4
     assert len({found["etag"] for found in then.values()}) == 2
 
@@ -178,7 +178,7 @@ def recording(recorded: Path) -> Iterator[Timeline]:
         yield recording
 
 
-async def test_it_tells_what_it_is_and_changes_nothing(recording: Timeline, clock: Clock) -> None:
+async def test_a_replay_is_marked_and_refuses_changes(recording: Timeline, clock: Clock) -> None:
     app = make_replay_app(Replay(recording, clock=clock), ACCESS)
     health = await ask(app, "GET", "/healthz", None)
     assert health.json() == {"status": "ok", "replay": True}
@@ -205,7 +205,7 @@ async def test_it_tells_what_it_is_and_changes_nothing(recording: Timeline, cloc
         assert (await ask(app, "GET", path)).headers["cellwatch-replay"] == "true"
 
 
-def test_it_plays_pauses_and_moves(recorded: Path, clock: Clock) -> None:
+def test_a_replay_plays_pauses_and_seeks(recorded: Path, clock: Clock) -> None:
     with Timeline([recorded]) as recording:
         assert duration_s(recording) == pytest.approx((STEPS - 1) * 0.1)
         played = Replay(recording, speed=2.0, start_s=0.5, clock=clock)
@@ -274,7 +274,7 @@ def test_a_killed_writer_leaves_all_but_its_last_chunk(tmp_path: Path, clock: Cl
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_damaged_file_is_as_much_as_is_there_or_one_sentence(recorded: Path, seed: int) -> None:
+def test_a_damaged_file_is_read_in_part_or_refused_in_one_sentence(recorded: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
     whole = recorded.read_bytes()
     served, refused, damaged = 0, 0, 60
@@ -298,7 +298,7 @@ def test_a_damaged_file_is_as_much_as_is_there_or_one_sentence(recorded: Path, s
     assert served + refused == damaged
 
 
-def test_a_damaged_chunk_is_passed_over(recorded: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_damaged_chunk_is_skipped(recorded: Path, caplog: pytest.LogCaptureFixture) -> None:
     with Recording(recorded) as recording:
         places = recording._index.chunks
         before = recording.at(recording.begin_ns + 10 * STEP_NS)
@@ -309,10 +309,10 @@ def test_a_damaged_chunk_is_passed_over(recorded: Path, caplog: pytest.LogCaptur
     with Recording(recorded) as recording:
         assert recording.at(recording.begin_ns + 15 * STEP_NS).log_ns == before.log_ns
         assert recording.at(recording.begin_ns + 30 * STEP_NS).log_ns == recording.begin_ns + 30 * STEP_NS
-    assert "damaged, passed over" in caplog.text
+    assert "is damaged and skipped" in caplog.text
 
 
-def test_what_is_no_recording_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_is_no_recording_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "empty.mcap").write_bytes(b"")
     (tmp_path / "text.mcap").write_text("no recording at all")
     with (tmp_path / "other.mcap").open("wb") as stream:
@@ -334,12 +334,12 @@ def test_what_is_no_recording_is_named(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 class Later(StateRecord):
-    """As a later version might have it."""
+    """A record of a possible later version."""
 
     temperature_c: float
 
 
-def test_a_recording_of_another_version_is_told_when_it_is_opened(
+def test_a_recording_of_another_version_is_reported_when_opened(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorded_module, "StateRecord", Later)
@@ -347,7 +347,7 @@ def test_a_recording_of_another_version_is_told_when_it_is_opened(
         Recording(recorded)
 
 
-def test_info_tells_what_is_in_it(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_lists_the_content(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["recording-info", str(recorded)]) == 0
     out = capsys.readouterr().out
     assert "(3.9 s)" in out
@@ -375,16 +375,16 @@ def test_a_moved_object_costs_a_transform_and_no_mesh(recorded: Path) -> None:
 
 
 def record_in_files(folder: Path, steps: tuple[int, ...], missing_s: float = 0.0) -> list[Path]:
-    """The same script, with a new file after each of these numbers of steps; between two, time is missing."""
+    """Record the same script, with a new file after each of these numbers of steps; between files, time is missing."""
     script = Script()
-    paths, begun = [], 0
+    paths, startup = [], 0
     for number, ended in enumerate((*steps, STEPS)):
         paths.append(folder / f"{9 - number}.mcap")
         file = RecordingFile(paths[-1], WALL_LESS_MONOTONIC_NS + round(number * missing_s * S))
-        for step in range(begun, ended):
+        for step in range(startup, ended):
             file.add(moment_of(script.master, script.step(step)))
         file.close()
-        begun = ended
+        startup = ended
     return paths
 
 
@@ -433,7 +433,7 @@ def test_each_file_counts_once(recorded: Path) -> None:
         Timeline([recorded, recorded])
 
 
-def test_info_tells_of_all_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_covers_all_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = record_in_files(tmp_path, (13,))
     assert main(["recording-info", *(str(path) for path in paths)]) == 0
     out = capsys.readouterr().out

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`master-server --cell CELL.YAML`: serve one cell until told to stop.
+"""`master-server --cell CELL.YAML`: serve one cell until stopped.
 
-`master-server replay FILE...` serves a recording in its place, `master-server recording-info FILE...` tells what is in
-one,
-`master-server new-token unit` replaces a token.
+`master-server replay FILE...` serves a recording in place of a master. `master-server recording-info FILE...` lists the
+content of a recording. `master-server new-token unit` replaces a token.
 """
 
 from __future__ import annotations
@@ -54,10 +53,10 @@ from shared.service import ServiceManager
 logger = logging.getLogger("master_server")
 
 STOP_S = 1
-"""Whole seconds that open requests are given when told to stop; a service manager counts on two in all."""
+"""Whole seconds for open requests at shutdown; a service manager allows two in all."""
 
 BACKLOG = 256
-"""Units that connect in the same moment, as after a power cut, with room to spare."""
+"""Units that connect in the same moment, for example after a power cut, with room to spare."""
 
 LOGGING = ("log_level", "log_format")
 LISTENING = ("host", "port", "state_dir", "ready_file", "public_reads", "tls_certificate", "tls_key", *LOGGING)
@@ -69,7 +68,7 @@ ANY_ADDRESS = ("0.0.0.0", "::")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; what can be expected to go wrong is one line and exit code 1."""
+    """Run the command; an expected failure is one line and exit code 1."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given and given[0] in PARSERS:
         options = PARSERS[given[0]]().parse_args(given[1:])
@@ -86,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Server(uvicorn.Server):
-    """Tells when it can be asked."""
+    """A server that reports when it is ready."""
 
     def __init__(
         self,
@@ -116,17 +115,17 @@ class _Server(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
         self._acceptor.start()
-        # What is there now stays; without this, each full collection looks through it, and all units wait 0.1 s.
+        # Exempt existing objects: each full collection would visit them, and all units would wait 0.1 s.
         gc.freeze()
         text = json.dumps(self._ready)
         if self._ready_file is not None:
             write_whole(self._ready_file, f"{text}\n".encode(), synced=False)
         print(f"master-server: listening at {self._ready['url']}{self._everywhere}", flush=True)
         for role in Role:
-            lies_in = self._ready[f"{role.value}_token_file"]
-            print(f"master-server: the token of the {role.value} lies in {lies_in}", flush=True)
+            path = self._ready[f"{role.value}_token_file"]
+            print(f"master-server: the token of the {role.value} is in {path}", flush=True)
         if self._gate is not None:
-            print(f"master-server: {self._way_in(self._gate)}", flush=True)
+            print(f"master-server: {self._viewer_line(self._gate)}", flush=True)
         self._manager.ready(self._status())
         if self._manager.is_present:
             self._informing = asyncio.create_task(self._manager.follow(self._status))
@@ -144,12 +143,12 @@ class _Server(uvicorn.Server):
         if self._announcing is not None:
             await asyncio.wait((self._announcing,))
 
-    def _way_in(self, gate: Gate) -> str:
+    def _viewer_line(self, gate: Gate) -> str:
         url = self._ready["url"]
         if not sys.stdout.isatty():
-            # What is printed here is kept in a log, and no log holds what opens a door.
-            return f"the cell is drawn at {url}{PAGE}"
-        return f"the cell is drawn at {url}{link_path(gate.sessions)} (works once, within {LINK_S // 60} minutes)"
+            # This line is kept in a log, and a log must not hold a link that grants access.
+            return f"the viewer is at {url}{PAGE}"
+        return f"the viewer is at {url}{link_path(gate.sessions)} (works once, within {LINK_S // 60} minutes)"
 
     def _protocol(self) -> GuardedHttp:
         return GuardedHttp(self.config, self.server_state, self.lifespan.state)
@@ -166,11 +165,13 @@ def _serve_master(options: argparse.Namespace) -> None:
         master = Master(cell, config.settings, store)
         recorder = Recorder(master, config.recording, config.state_dir / "recordings")
 
-        def says(sha256: str) -> Announcement:
+        def announce(sha256: str) -> Announcement:
             cell = master.published.reference
             return Announcement(cell.name, cell.sha256, CONTRACT_VERSION, bool(sha256), sha256)
 
-        _serve(config, lambda access, limits: make_app(master, access, recorder, limits), says if announced else None)
+        _serve(
+            config, lambda access, limits: make_app(master, access, recorder, limits), announce if announced else None
+        )
 
 
 def _serve_replay(options: argparse.Namespace) -> None:
@@ -183,7 +184,7 @@ def _serve_replay(options: argparse.Namespace) -> None:
         _serve(config, lambda access, limits: make_replay_app(replay, access, limits))
 
 
-def _tell_recording(options: argparse.Namespace) -> None:
+def _print_recording_info(options: argparse.Namespace) -> None:
     configure(options.log_level or "INFO", options.log_format or "text")
     with _opened(options.files) as recording:
         print("\n".join(summary(recording)))
@@ -191,11 +192,11 @@ def _tell_recording(options: argparse.Namespace) -> None:
 
 def _replace_token(options: argparse.Namespace) -> None:
     path = write_token(options.state_dir, Role(options.role))
-    print(f"master-server: the new token of the {options.role} lies in {path}; a master that runs on it takes it now")
+    print(f"master-server: the new token of the {options.role} is in {path}; a running master uses it within a second")
 
 
 def _opened(files: Sequence[Path]) -> Timeline:
-    """A recording; a person is told how far the reading is."""
+    """Open a recording; show the progress at a terminal."""
     columns = (TextColumn("reading"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task("reading", total=None)
@@ -205,9 +206,9 @@ def _opened(files: Sequence[Path]) -> Timeline:
 def _serve(
     config: ServerConfig,
     make: Callable[[Access, Limits], Application],
-    says: Callable[[str], Announcement] | None = None,
+    announce: Callable[[str], Announcement] | None = None,
 ) -> None:
-    """Serve until told to stop; `says` is given the certificate's fingerprint, empty without TLS, and announced."""
+    """Serve until stopped; `announce` turns the certificate's fingerprint (empty without TLS) into an announcement."""
     access = load_access(config.state_dir, config.public_reads)
     tls, sha256 = None, ""
     if config.tls_certificate is not None and config.tls_key is not None:
@@ -233,7 +234,7 @@ def _serve(
             http=GuardedHttp,
             log_config=None,
             access_log=False,
-            # The caller's address is that of its connection, whatever a header says.
+            # The caller's address is that of its connection; headers are ignored.
             proxy_headers=False,
             server_header=False,
             date_header=False,
@@ -247,13 +248,13 @@ def _serve(
         config.ready_file,
         config.host,
         lambda: _status(app.services.master, ready["url"]),
-        Announcer(lambda: says(sha256), listens_at, port) if says is not None else None,
+        Announcer(lambda: announce(sha256), listens_at, port) if announce is not None else None,
         gate,
     )
-    # Once it has stopped in good order, the server raises the signal that it got again.
+    # After an orderly stop, the server raises the signal again that it received.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        # It opens none itself: those of the listener are taken in within bounds.
+        # It opens no socket itself: it gets bounded connections from the acceptor.
         server.run(sockets=[])
     finally:
         listener.close()
@@ -262,7 +263,7 @@ def _serve(
 
 
 def _status(master: Readable, url: str) -> str:
-    """One line for a person: how many units are live, and where the master listens."""
+    """Return one line for people: the number of live units, and the master's address."""
     states = [unit.state for unit in master.unit_states(monotonic_ns())]
     return f"{states.count('live')} of {len(states)} units live; at {url}"
 
@@ -273,7 +274,7 @@ def _listen(host: str, port: int) -> socket.socket:
         listener = socket.create_server((host, port), family=family, backlog=BACKLOG, dualstack_ipv6=host == "::")
     except OSError as error:
         raise ConfigError(f"cannot listen at {host} port {port}: {error.strerror or error}") from error
-    # Connections inherit it. Without, the second half of an answer waits 40 ms for the first to be acknowledged.
+    # Connections inherit this. Without it, the second half of an answer waits 40 ms for an acknowledgement.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listener
 
@@ -299,36 +300,36 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.set_defaults(run=_serve_master)
     parser.add_argument("--config", type=Path, metavar="YAML", help="configuration file")
-    parser.add_argument("--cell", type=Path, metavar="YAML", help="the cell that is watched (cell.yaml)")
+    parser.add_argument("--cell", type=Path, metavar="YAML", help="the watched cell (cell.yaml)")
     _add_server_options(parser)
     parser.add_argument(
         "--announce",
         action=argparse.BooleanOptionalAction,
-        help="tell units by multicast DNS where it listens (default: unless that is loopback only)",
+        help="announce the address by multicast DNS (default: unless it is loopback only)",
     )
-    parser.add_argument("--record", type=Path, metavar="DIR", help="record what the master sees, as MCAP files")
+    parser.add_argument("--record", type=Path, metavar="DIR", help="record the master's state, as MCAP files")
     return parser
 
 
 def _replay_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="master-server replay",
-        description="Serve a recording as if it were the master; pause and move in it.",
+        description="Serve a recording as if it were the master; pause and seek in it.",
     )
     parser.set_defaults(run=_serve_replay)
     parser.add_argument(
         "files", type=Path, nargs="+", metavar="FILE", help="a recording (.mcap), or all files of one, in any order"
     )
-    parser.add_argument("--speed", type=float, help="1 is as it was")
-    parser.add_argument("--from", dest="start_s", type=_seconds, metavar="TIME", help="begin there, as in 30s or 5m")
-    parser.add_argument("--loop", action="store_true", default=None, help="begin anew at the end")
+    parser.add_argument("--speed", type=float, help="1 is real time")
+    parser.add_argument("--from", dest="start_s", type=_seconds, metavar="TIME", help="start there, as in 30s or 5m")
+    parser.add_argument("--loop", action="store_true", default=None, help="start anew at the end")
     _add_server_options(parser)
     return parser
 
 
 def _info_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="master-server recording-info", description="Tell what is in a recording.")
-    parser.set_defaults(run=_tell_recording)
+    parser = argparse.ArgumentParser(prog="master-server recording-info", description="List a recording's content.")
+    parser.set_defaults(run=_print_recording_info)
     parser.add_argument(
         "files", type=Path, nargs="+", metavar="FILE", help="a recording (.mcap), or all files of one, in any order"
     )
@@ -339,12 +340,12 @@ def _info_parser() -> argparse.ArgumentParser:
 def _token_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="master-server new-token",
-        description="Replace a token: a master that runs refuses the one before within a second, and ends streams that "
-        "were opened with it. The token itself is printed nowhere.",
+        description="Replace a token: a running master refuses the old one within a second, and ends streams that "
+        "were opened with it. The token itself is not printed.",
     )
     parser.set_defaults(run=_replace_token)
     parser.add_argument("role", choices=[role.value for role in Role], help="whose token")
-    parser.add_argument("--state-dir", type=Path, metavar="DIR", required=True, help="that of the master")
+    parser.add_argument("--state-dir", type=Path, metavar="DIR", required=True, help="state folder of the master")
     return parser
 
 
@@ -352,25 +353,25 @@ def _add_server_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", help="address to listen at (default: all)")
     parser.add_argument("--port", type=int, help="port to listen at, 0 for a free one (default: 8420)")
     parser.add_argument(
-        "--state-dir", type=Path, metavar="DIR", help="where tokens are kept, and what outlives the master"
+        "--state-dir", type=Path, metavar="DIR", help="folder of the tokens and of all state that outlives the master"
     )
-    parser.add_argument("--tls-certificate", type=Path, metavar="PEM", help="speak TLS with this certificate ...")
+    parser.add_argument("--tls-certificate", type=Path, metavar="PEM", help="serve TLS with this certificate ...")
     parser.add_argument("--tls-key", type=Path, metavar="PEM", help="... and its key")
-    parser.add_argument("--ready-file", type=Path, metavar="FILE", help="written as JSON when the master can be asked")
+    parser.add_argument("--ready-file", type=Path, metavar="FILE", help="written as JSON when the master is ready")
     parser.add_argument("--public-reads", action="store_true", default=None, help="reading needs no token")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="any other, as in settings.voxel_size_m=0.03"
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="any other field: settings.voxel_size_m=0.03"
     )
     _add_log_options(parser)
 
 
 def _add_log_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--log-level", choices=get_args(LogLevel), help="the least that is logged (default: INFO)")
+    parser.add_argument("--log-level", choices=get_args(LogLevel), help="lowest level that is logged (default: INFO)")
     parser.add_argument("--log-format", choices=get_args(LogFormat), help="lines as text or as JSON (default: text)")
 
 
 def _seconds(text: str) -> float:
-    """`90`, `90s`, `1.5m` or `1h`."""
+    """Parse `90`, `90s`, `1.5m` or `1h`."""
     number, unit = (text[:-1], text[-1]) if text[-1:] in SECONDS else (text, "s")
     try:
         return float(number) * SECONDS[unit]

@@ -14,7 +14,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from master_server.api.history import History
-from master_server.api.image_requests import Pictures
+from master_server.api.image_requests import ImageRequests
 from master_server.api.map_stream import Stream
 from master_server.api.metrics import VERSION, Metrics
 from master_server.api.openapi import describe, illustrate, serve_documentation
@@ -37,14 +37,14 @@ from shared.configuration import sentence_of
 from shared.errors import CellError, CellwatchError, InputError, Refusal, WireError
 
 TRY_AGAIN_LATER = 1013
-"""What a WebSocket is closed with when there were too many."""
+"""Close code of a WebSocket after too many requests."""
 
 REPLAY_HEADER = (b"cellwatch-replay", b"true")
-"""With every answer of a replay, so that nobody takes it for now."""
+"""Header of every answer of a replay, so that nobody mistakes it for live data."""
 
 
 class Application(FastAPI):
-    """FastAPI, but for the one path that takes an update: it is spared the way through it."""
+    """FastAPI, except that an update bypasses its routing."""
 
     services: Services
     update: ASGIApp
@@ -52,12 +52,12 @@ class Application(FastAPI):
     _described_for: ReadableCell | None = None
 
     def take_updates(self, update: ASGIApp) -> None:
-        """From now on `update` answers `POST /update`."""
+        """Let `update` answer `POST /update`."""
         self.update = update
         self.router.routes.append(Route("/update", update, methods=["POST"]))
 
     def openapi(self) -> dict[str, Any]:
-        """The API described, with examples for the cell as it is now."""
+        """Return the OpenAPI document, with examples for the current cell."""
         master = self.services.master
         if self.openapi_schema is None:
             self.openapi_schema = describe(self, isinstance(self, ReplayApplication))
@@ -71,7 +71,7 @@ class Application(FastAPI):
             await super().__call__(scope, receive, send)
             return
         scope["app"] = self
-        # Before anything else, so that whom it refuses costs next to nothing.
+        # The rate limit comes first, so that a refused caller costs almost nothing.
         try:
             self.services.limits.admit(ip_of(scope), monotonic_ns())
         except Refusal as refusal:
@@ -88,7 +88,7 @@ class Application(FastAPI):
 
 
 class ReplayApplication(Application):
-    """The same, each answer marked as that of a replay."""
+    """The same, with each answer marked as that of a replay."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         async def marked(message: Message) -> None:
@@ -102,7 +102,7 @@ class ReplayApplication(Application):
 def make_app(
     master: Master, access: Access, recorder: Recorder | None = None, limits: Limits | None = None
 ) -> Application:
-    """The application that serves one master; `limits` are shared with what holds its connections."""
+    """Return the application of one master; share its `limits` with the acceptor of its connections."""
     routers = [module.router for module in (units, images, cell, map, stream, robot, recording, health)]
     limits = limits or Limits()
     listeners = Stream(master)
@@ -114,7 +114,7 @@ def make_app(
         history=History(master),
         recorder=recorder,
         loader=CellLoader(),
-        pictures=Pictures(master.registry),
+        image_requests=ImageRequests(master.registry),
         metrics=Metrics(master, listeners, limits),
         started_at_ns=monotonic_ns(),
     )
@@ -124,7 +124,7 @@ def make_app(
 
 
 def make_replay_app(played: Replay, access: Access, limits: Limits | None = None) -> Application:
-    """The application that serves a recording as if it were the master."""
+    """Return the application that serves a recording in place of a master."""
     routers = [module.router for module in (units, cell, map, stream, robot, recording, replay)]
     services = Services(
         master=played, access=access, limits=limits or Limits(), stream=Stream(played), history=History(played)
@@ -135,7 +135,7 @@ def make_replay_app(played: Replay, access: Access, limits: Limits | None = None
 
 
 def add_viewer(app: Application, actions: dict[str, str]) -> Gate:
-    """Let operators see it under `/viewer/`; costs nothing while nobody looks."""
+    """Add the viewer under `/viewer/`; it costs nothing until a browser opens it."""
     services = app.services
     host = ViewerHost(app, services.master, services.history, services.access, actions)
     app.gate = Gate(host, Sessions(services.access))
@@ -152,7 +152,7 @@ def _assembled(
 ) -> Application:
     @asynccontextmanager
     async def running(_: FastAPI) -> AsyncIterator[None]:
-        # Now, while nobody waits for it.
+        # At start, while nobody waits for it.
         app.openapi()
         if ticker is not None:
             ticker.start()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lines of the log, as text or as JSON: no secret in any, and none repeated without end.
+"""Log lines as text or JSON, without secrets and without endless repetition.
 
-Lines about a unit or a reader carry `event`, `ip` and, where there is one, `unit_id` besides their text.
+Lines about a unit or a reader carry `event`, `ip` and, if there is a unit, `unit_id` besides their text.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ LogFormat = Literal["text", "json"]
 LogLevel = Literal["DEBUG", "INFO", "WARNING", "ERROR"]
 
 BURST = 10
-"""Lines of one event and one source in a window: a unit that comes and goes is told, its every turn is not."""
+"""Lines of one event and one source in a window: some reconnects of a unit are logged, not all of an unstable one."""
 
 WINDOW_NS = 60 * NS_PER_S
 
 MAX_SOURCES = 256
-"""Events of the units and of a network's worth of strangers; the longest silent one is forgotten first."""
+"""Events of all units and of the strangers in a network; beyond, the one that was silent longest is dropped."""
 
-# A token is no shorter than 16 characters; what calls itself one in an address is one whatever its length.
+# A token has at least 16 characters; a parameter named token in an address is redacted at any length.
 SECRET = re.compile(r"(bearer(?:[ .]|%20))[^\s\"'&,\\]{16,}|(token=)[^\s\"'&\\]+", re.IGNORECASE)
 
 ACCESS_LINE = '"WebSocket %s"'
-"""In what the web server says of each reader, with the whole address; the stream's own lines say it without."""
+"""Marks the web server's own line about a reader, with the whole address; the stream logs the same without it."""
 
 
 def configure(level: LogLevel, form: LogFormat) -> None:
-    """Send all lines, the web server's too, to standard error; not where something else has taken them over."""
+    """Send all lines, including the web server's, to standard error, unless the host program has set up logging."""
     handler = logging.StreamHandler()
     handler.setFormatter(_Redacted(_JSON if form == "json" else _TEXT))
     handler.addFilter(_without_access_lines)
@@ -44,19 +44,19 @@ def configure(level: LogLevel, form: LogFormat) -> None:
 
 
 def redacted(line: str) -> str:
-    """The line with every token in it blotted out."""
+    """Return the line with every token in it replaced."""
     return SECRET.sub(lambda found: f"{found[1] or found[2]}***", line)
 
 
 class Repeats(logging.Filter):
-    """Passes `BURST` lines of one event and source in each window, and tells in the next how many it left out."""
+    """Pass `BURST` lines of one event and source in each window; the next window reports how many were left out."""
 
     def __init__(self) -> None:
         super().__init__()
         self._sources: OrderedDict[tuple[object, ...], _Window] = OrderedDict()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether the line is written."""
+        """Return True if the line is to be written."""
         event = getattr(record, "event", None)
         if event is None:
             return True
@@ -81,7 +81,7 @@ class _Window:
         self._count = 0
 
     def begin_anew(self, now_ns: int) -> int:
-        """Begin another when this one is over; returns how many lines were left out of it."""
+        """Start another window when this one is over; return how many lines it left out."""
         if now_ns - self._began_ns < WINDOW_NS:
             return 0
         left_out = max(self._count - BURST, 0)
@@ -94,7 +94,7 @@ class _Window:
 
 
 class _Redacted(logging.Formatter):
-    """Any formatter's line, looked through as a whole: messages, arguments and tracebacks alike."""
+    """Redact the whole line of another formatter: messages, arguments and tracebacks."""
 
     def __init__(self, inner: logging.Formatter) -> None:
         super().__init__()

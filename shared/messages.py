@@ -16,6 +16,9 @@ own, so a master is updated before its units. Rules for changes of this file:
     rows       Rows are values without names. They grow at their end: a unit ignores values beyond those it knows, and
                a master reads a shorter row as one whose last values are at their defaults.
     defaults   Defaults never change, since a value at its default may be omitted.
+    codes      Codes of a status (states, reasons, outcomes, tasks, troubles) may be added. This version writes only
+               those that its types list. A reader takes any (`OPEN`): an unknown code stays a string and means nothing
+               good. Codes in requests, and in settings, cell, pose, joints and commands, are closed.
 
 `tests/shared/golden` records the messages of each minor; these records never change.
 """
@@ -31,10 +34,13 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    GetCoreSchemaHandler,
     TypeAdapter,
+    ValidationError,
     field_validator,
     model_validator,
 )
+from pydantic_core import CoreSchema, core_schema
 
 from shared.camera import Intrinsics
 from shared.errors import InputError
@@ -85,6 +91,34 @@ def is_newer(contract: object, minor: object) -> bool:
     return (contract, minor) > (CONTRACT_VERSION, CONTRACT_MINOR)
 
 
+@dataclass(frozen=True)
+class OpenCode:
+    """Mark a code in a status as open: a reader keeps a code of a later minor as a string of at most `MAX_TEXT`.
+
+    The static type stays the `Literal` of the codes that this version writes. A program that reads must treat each
+    code that it does not know as not live and not complete. The JSON schema lists the known codes.
+    """
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.union_schema([handler(source), core_schema.str_schema(max_length=MAX_TEXT)])
+
+
+OPEN = OpenCode()
+
+
+def known_names(model: type[BaseModel]) -> BeforeValidator:
+    """Make a validator that drops the names that `model` does not have; for parts of a status that else refuse them."""
+
+    def known(fields: Any) -> Any:
+        return (
+            {name: fields[name] for name in fields if name in model.model_fields}
+            if isinstance(fields, dict)
+            else fields
+        )
+
+    return BeforeValidator(known)
+
+
 def _printable(text: str) -> str:
     if not text.isprintable():
         raise ValueError("expected only printable characters, since logs show the text")
@@ -113,6 +147,9 @@ Verb = Literal["learn_background", "drop_background", "calibrate", "refine", "im
 ImageKind = Literal["depth", "expected", "foreground"]
 PoseOrigin = Literal["configured", "board", "refined", "operator", "source"]
 ReportedOrigin = Literal["configured", "source"]
+RobotState = Literal["fresh", "stale", "silent", "none"]
+Task = Literal["background", "refinement", "calibration"]
+"""Tasks that report their progress: learning the background model, refining the pose, finding it by the board."""
 TroubleCode = Literal["camera", "board", "background", "joints", "frame", "contract"]
 """Trouble of a unit:
 
@@ -354,7 +391,7 @@ class Reason:
     # Readers ignore additional names of a later master, also inside a message that forbids unknown names.
     __pydantic_config__ = ConfigDict(extra="ignore")
 
-    code: ReasonCode
+    code: Annotated[ReasonCode, OPEN]
     sentence: str
     numbers: dict[str, float] = field(default_factory=dict)
 
@@ -368,7 +405,7 @@ ReadReason = Annotated[Reason, BeforeValidator(_REASON.validate_python)]
 class Progress(Message):
     """Progress of a task: `done` of `total` frames."""
 
-    task: Literal["background"]
+    task: Task
     done: Counter
     total: Counter
 
@@ -392,6 +429,33 @@ class Health(Message):
     blind: Text | None = Field(default=None, description="Reason to believe that the camera is covered or dazzled.")
     trouble_code: TroubleCode | None = Field(default=None, description="The trouble, for programs; since 5.1.")
     progress: Progress | None = Field(default=None, description="Progress of the running task; since 5.1.")
+
+
+class StatusProgress(Progress):
+    """Progress in a status: unknown names are ignored, unknown tasks kept."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    task: Annotated[Task, OPEN]
+
+
+class StatusHealth(Health):
+    """Health in a status: unknown names are ignored, unknown codes kept."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    trouble_code: Annotated[TroubleCode, OPEN] | None = None
+    progress: StatusProgress | None = None
+
+
+def _status_health(health: object) -> object:
+    """Read a health that this version knows as `Health`, so that equal ones are equal; others as `StatusHealth`."""
+    if not isinstance(health, dict):
+        return health
+    try:
+        return Health.model_validate(health)
+    except ValidationError:
+        return StatusHealth.model_validate(health)
 
 
 class UpdateRequest(Message):
@@ -465,7 +529,7 @@ class JointsRequest(Message):
 class RobotAnswer(Message):
     """`GET /robot`: `fresh`, `stale` (no recent report), `silent` (never reported), or `none` (no robot)."""
 
-    state: Literal["fresh", "stale", "silent", "none"]
+    state: RobotState
     reason: Text = ""
     joint_names: tuple[str, ...]
     age_s: float | None = None
@@ -477,9 +541,9 @@ class CommandRow(Answer):
     """The last command of an operator to a unit."""
 
     id: Counter
-    verb: Verb
+    verb: Annotated[Verb, OPEN]
     outcome: Text | None = Field(description="`done`, or the reason; absent while the command runs.")
-    code: OutcomeCode | None = Field(default=None, description="The outcome, for programs.")
+    code: Annotated[OutcomeCode, OPEN] | None = Field(default=None, description="The outcome, for programs.")
     detail: Text = Field(default="", description="The result, or the reason why it failed.")
 
     def ended(self, outcome: Outcome) -> CommandRow:
@@ -489,17 +553,19 @@ class CommandRow(Answer):
 
 
 class UnitRow(Answer):
-    """One unit in `GET /units`."""
+    """One unit in `GET /units`: a status, of which a reader ignores unknown names and keeps unknown codes."""
 
     id: Counter
     ip: str
     serial: str
     model: str
     software: str
-    state: State
+    state: Annotated[State, OPEN]
     reason: str
     cause: ReadReason | None = Field(default=None, description="The reason, for programs; absent when there is none.")
-    phase: Phase = Field(default="live", description="Phase of its start: registering, fetching, localising, live.")
+    phase: Annotated[Phase, OPEN] = Field(
+        default="live", description="Phase of its start: registering, fetching, localising, live."
+    )
     age_s: float | None = Field(description="Age of its last frame, since the capture.")
     arrival_age_s: float | None = Field(description="Age of its last update, since the arrival.")
     clock_uncertainty_ms: float | None
@@ -507,11 +573,11 @@ class UnitRow(Answer):
     voxels: int
     process_ms: float
     frame_number: int
-    health: Health
+    health: Annotated[Health, BeforeValidator(_status_health)]
     T_world_camera: Matrix | None
-    pose_origin: PoseOrigin | None = Field(default=None, description="Origin of the camera's pose.")
-    pose_quality: PoseQuality = PoseQuality()
-    intrinsics: Intrinsics | None = Field(
+    pose_origin: Annotated[PoseOrigin, OPEN] | None = Field(default=None, description="Origin of the camera's pose.")
+    pose_quality: Annotated[PoseQuality, known_names(PoseQuality)] = PoseQuality()
+    intrinsics: Annotated[Intrinsics, known_names(Intrinsics)] | None = Field(
         default=None, description="Intrinsics of its camera from its registration; absent before."
     )
     range_m: float | None = Field(

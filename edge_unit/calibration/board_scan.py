@@ -58,8 +58,10 @@ class BoardSearch:
         """Search at once, and with short pauses again."""
         self._next_ns, self._retry_s = 0, RETRY_MIN_S
 
-    async def scan(self, board: Board, tell: Callable[[str], None]) -> Localisation:
-        """Take images until they give the pose, or will not; `tell` receives the progress meanwhile.
+    async def scan(self, board: Board, tell: Callable[[str, int], None]) -> Localisation:
+        """Take images until they give the pose, or will not.
+
+        `tell` receives, after each image, a sentence and the number of images that gave a pose, of `FRAMES`.
 
         Raises:
             BoardError: the images do not give a pose; one sentence with the remedy.
@@ -80,7 +82,7 @@ class BoardSearch:
                 async with aclosing(feed.images()) as images:
                     async for image in images:
                         sighting = await asyncio.to_thread(localiser.add, image.pixels.copy())
-                        tell(f"looking for the board: {localiser.now}")
+                        tell(f"searching for the board: {localiser.now}", localiser.frames_with_pose)
                         seen += 1
                         empty = 0 if sighting.detection.markers else empty + 1
                         late = self._clock.now_ns() - begun_ns > MAX_LOOK_S * NS_PER_S

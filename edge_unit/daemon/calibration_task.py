@@ -6,13 +6,13 @@ from __future__ import annotations
 import logging
 
 from edge_unit.calibration.board_layout import require_board
-from edge_unit.calibration.board_scan import BoardSearch
+from edge_unit.calibration.board_scan import FRAMES, BoardSearch
 from edge_unit.daemon.report import troubled
 from edge_unit.sources.frame import DepthFrame
 from edge_unit.uplink.assignment import Assignment, Trouble
 from edge_unit.uplink.uplink import Uplink
 from shared.errors import CellwatchError
-from shared.messages import DONE, Outcome, PoseQuality
+from shared.messages import DONE, Outcome, PoseQuality, Progress
 
 logger = logging.getLogger(__name__)
 
@@ -23,8 +23,9 @@ async def localise(search: BoardSearch, uplink: Uplink, assignment: Assignment, 
     `frame` is the last one before the search; the progress of the search is reported as its trouble.
     """
 
-    def tell(seen: str) -> None:
-        uplink.offer(troubled(assignment, frame, Trouble("board", seen)))
+    def tell(seen: str, images: int) -> None:
+        progress = Progress(task="calibration", done=min(images, FRAMES), total=FRAMES)
+        uplink.offer(troubled(assignment, frame, Trouble("board", seen, progress)))
 
     first = not search.outcome
     try:
@@ -38,7 +39,7 @@ async def localise(search: BoardSearch, uplink: Uplink, assignment: Assignment, 
     except CellwatchError as error:
         # It retries without end, but warns once.
         logger.log(logging.WARNING if first else logging.DEBUG, "%s", error)
-        tell(f"looking for the board: {error}")
+        uplink.offer(troubled(assignment, frame, Trouble("board", f"searching for the board: {error}")))
         return Outcome("failed", str(error))
     logger.info(
         "found the board in %d of %d images: the pose is known to %.1f mm and %.2f degrees",

@@ -114,6 +114,8 @@ class FrameProcessor:
         warning = verdict.warning or self.joints.warning(assignment.settings.joint_delay_s) or crowd
         health = health_of(result, frame, verdict, warning)
         self._refining.gather(pipeline, frame.depth, joints)
+        if (progress := self._refining.progress) is not None:
+            health = health.model_copy(update={"progress": progress})
         keys = keys_to_bytes(voxels.keys)
         stages.end("report")
         return Report(assignment, frame.captured_at_ns, keys, seen, health, stages.took_ns)

@@ -17,7 +17,7 @@ from edge_unit.monitoring import PoseMonitor
 from edge_unit.pipeline import DepthPipeline, Refiner
 from edge_unit.uplink.uplink import Uplink
 from shared.errors import CellwatchError
-from shared.messages import Command, Outcome, PoseQuality
+from shared.messages import Command, Outcome, PoseQuality, Progress
 
 logger = logging.getLogger(__name__)
 
@@ -42,6 +42,12 @@ class RefinementTask:
         self._assigned = assigned
         self._monitor = monitor
         self._gathered: RefinementFrames | None = None
+
+    @property
+    def progress(self) -> Progress | None:
+        """Frames gathered of those needed; None while no refinement runs."""
+        gathered = self._gathered
+        return None if gathered is None else Progress(task="refinement", done=len(gathered.frames), total=REFINE_FRAMES)
 
     def begin(self, pipeline: DepthPipeline, command: Command) -> None:
         """Start to gather frames on `command`."""

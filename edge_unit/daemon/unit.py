@@ -234,7 +234,7 @@ class Unit:
         self._work.assigned.pipeline = None
         self._finish(orders.changes, Outcome("refused", NO_POSE))
         seen = self._search.outcome
-        searching = Trouble("board", f"looking for the board: {seen}") if seen else None
+        searching = Trouble("board", f"searching for the board: {seen}") if seen else None
         report = troubled(assignment, frame, searching)
         self._status.note_trouble(report.health.trouble or NO_POSE)
         self.uplink.offer(report)

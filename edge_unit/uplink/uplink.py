@@ -81,8 +81,11 @@ JOINTS_TIMEOUT_S = 0.02
 NOT_OURS = frozenset({400, 401, 403, 404, 405, 426})
 """Who answers a registration like this is no master for us: of another contract or token, or none at all."""
 
-CONTRACT_RETRY_S = 5.0
-"""Before a newer master that was not understood is asked again, although it told no change."""
+CONTRACT_RETRY_MIN_S, CONTRACT_RETRY_MAX_S = 5.0, 300.0
+"""Pauses before this unit registers again at a newer master that it does not understand and that reports no change.
+
+They double: what helps is an update of this unit, which starts it anew, or a change at the master, which it reports.
+"""
 
 START_OVER = frozenset({401, 403, 404, 409})
 """The master does not know this token, unit, session or address any more: register again."""
@@ -95,7 +98,8 @@ class _Unclear:
     session: int
     versions: Versions
     trouble: Trouble
-    since_ns: int
+    retry_at_ns: int
+    reported: bool = False
 
 
 @dataclass
@@ -104,6 +108,7 @@ class _Told:
 
     complaint: str = ""
     refused: str = ""
+    contract_retry_s: float = CONTRACT_RETRY_MIN_S
     found_by: str = ""
 
 
@@ -363,18 +368,25 @@ class Uplink:
         """Do not follow a newer master that is not understood: what is unknown may have to be left unfiltered."""
         theirs, ours = f"{CONTRACT_VERSION}.{slot.contract_minor}", f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
         trouble = Trouble("contract", f"update this unit: it speaks contract {ours}, its master {theirs}: {error}")
-        self._unclear = _Unclear(slot.session, slot.versions, trouble, self._time.now_ns())
-        level = logging.DEBUG if trouble.sentence == self._told.refused else logging.WARNING
+        # As long as the trouble is the same one, registering again did not help.
+        known = trouble.sentence == self._told.refused
+        retry_s = min(2.0 * self._told.contract_retry_s, CONTRACT_RETRY_MAX_S) if known else CONTRACT_RETRY_MIN_S
+        self._told.contract_retry_s = retry_s
+        retry_at_ns = self._time.now_ns() + round(retry_s * NS_PER_S)
+        self._unclear = _Unclear(slot.session, slot.versions, trouble, retry_at_ns)
+        level = logging.DEBUG if known else logging.WARNING
         logger.log(level, "%s", trouble.sentence)
         self._told.refused = trouble.sentence
 
     async def _tell_unclear(self, unclear: _Unclear) -> None:
         """Tell why nothing is reported; register again when the master says something else, or now and then."""
         self._outbox.drop()
-        await self._outbox.woken()
-        self._outbox.drop()
+        # The first one goes at once: until it arrives, the master knows only that this unit registered.
+        if unclear.reported:
+            await self._outbox.woken()
+            self._outbox.drop()
         sent_at_ns = self._time.now_ns()
-        if sent_at_ns - unclear.since_ns > CONTRACT_RETRY_S * NS_PER_S:
+        if sent_at_ns > unclear.retry_at_ns:
             self._start_over()
             return
         answer = await self._client.update(
@@ -391,6 +403,7 @@ class Uplink:
             )
         )
         self._session.note(sent_at_ns, answer, self._time.now_ns())
+        self._unclear = replace(unclear, reported=True)
         if answer.versions != unclear.versions:
             self._start_over()
 

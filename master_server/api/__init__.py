@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The master as HTTP: what is told to whom, in which words.
+"""The HTTP API of the master.
 
 It is assembled by `master_server.app`; this page re-exports nothing. In the order of the flow:
 
-    responses       what readers are told of the map
+    responses       the answers to readers of the map
     map_stream      the map as it changes, for many listeners
-    image_requests  what units are asked to show
-    history         the last minutes in a few figures
-    metrics         what a monitoring system reads
-    services        what the routes of one application work with
-    openapi         the API described, with examples for the cell that is watched
+    image_requests  requests for a unit's images
+    history         a few figures over the last minutes
+    metrics         the series for a monitoring system
+    services        the objects that the routes of one application use
+    openapi         the description of the API, with examples for the watched cell
     routes/         each part of the API as HTTP
 """

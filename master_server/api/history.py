@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The last minutes of a master in a few figures, there at once for who begins to look."""
+"""A few figures of a master over the last minutes, available at once to a new viewer."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ logger = logging.getLogger(__name__)
 PERIOD_S = 1.0
 
 SAMPLES_MAX = 300
-"""Five minutes: long enough to see what changed when a camera was touched, some 30 kB."""
+"""Five minutes: long enough to see the effect of a touched camera, about 30 kB."""
 
 
 class Sample(NamedTuple):
-    """How things stood at `at_ns` of the master's clock."""
+    """The figures at `at_ns` of the master's clock."""
 
     at_ns: int
     oldest_view_age_s: float | None
@@ -34,13 +34,13 @@ class Sample(NamedTuple):
 
 
 class HistoryAnswer(BaseModel):
-    """`GET /history`: one value a sample in each list, the oldest first."""
+    """`GET /history`: one value per sample in each list, the oldest first."""
 
-    now_ns: int = Field(description="By the same clock as `at_ns`.")
-    period_s: float = Field(description="Between two samples.")
+    now_ns: int = Field(description="Present time of the clock of `at_ns`.")
+    period_s: float = Field(description="Time between two samples.")
     at_ns: list[int]
     oldest_view_age_s: list[float | None] = Field(
-        description="The scene refresh time: since the capture of the oldest view in the map; null with no live unit."
+        description="The scene refresh time: age of the oldest view in the map since its capture; null if none is live."
     )
     voxels: list[int]
     units_live: list[int]
@@ -48,7 +48,7 @@ class HistoryAnswer(BaseModel):
 
 
 class History:
-    """Samples of a master, or of a recording as it is played; the newest `SAMPLES_MAX`."""
+    """Samples of a master, or of a recording that plays; the newest `SAMPLES_MAX`."""
 
     def __init__(self, master: Readable) -> None:
         self._master = master
@@ -60,7 +60,7 @@ class History:
             try:
                 self.take(monotonic_ns())
             except Refusal as refusal:
-                # A recording may be damaged in its middle; who asks for the map is told.
+                # A recording may be damaged in its middle; requests for the map report that.
                 logger.debug("history: %s", refusal)
             await asyncio.sleep(PERIOD_S)
 
@@ -75,11 +75,11 @@ class History:
         self._samples.append(Sample(now_ns, age_s, len(view.keys), view.units_live, view.complete))
 
     def since(self, at_ns: int) -> list[Sample]:
-        """All samples after `at_ns`, the oldest first."""
+        """Return all samples after `at_ns`, the oldest first."""
         return list(takewhile(lambda sample: sample.at_ns > at_ns, reversed(self._samples)))[::-1]
 
     def answer(self, now_ns: int) -> HistoryAnswer:
-        """All of it."""
+        """Return all samples."""
         samples = self.since(-1)
         columns = {name: [getattr(sample, name) for sample in samples] for name in Sample._fields}
         return HistoryAnswer(now_ns=now_ns, period_s=PERIOD_S, **columns)

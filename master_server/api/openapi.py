@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The API described: what every route answers, also when it refuses, and examples for the cell that is watched.
+"""The OpenAPI description: the answers and refusals of each route, and examples for the watched cell.
 
-FastAPI knows the models; what it does not know is added here: the one shape of all refusals, `POST /update`, which does
-not pass through it, and examples that run as they stand.
+FastAPI knows the models. This module adds the rest: the one shape of all refusals, `POST /update`, which bypasses
+FastAPI, and examples that work as they are.
 """
 
 from __future__ import annotations
@@ -57,15 +57,15 @@ the header `Authorization`, or as the subprotocol `bearer.<token>` beside `cellw
 REASONS = {
     400: "The request contradicts itself, or the unit speaks another contract.",
     401: "No valid token.",
-    403: "The token is another role's, or the unit another address's.",
-    404: "There is no such thing here.",
+    403: "The token belongs to another role, or the unit to another address.",
+    404: "The named thing does not exist here.",
     408: "The body came too slowly.",
-    409: "Not now: something else is under way, or what was sent is older than what is known.",
+    409: "Not now: something else is in progress, or the data is older than the known data.",
     413: "The body is too large.",
     415: "The body is of another type.",
     422: "A field is missing, unknown, of another type or out of range; it is named.",
-    429: "Too many requests, or too many wrong tokens, of this address; `Retry-After` says when to come again.",
-    503: "The master has no place left.",
+    429: "Too many requests, or too many wrong tokens, from this address; `Retry-After` gives the time to wait.",
+    503: "The master has reached a bound, such as its number of units.",
     504: "The unit did not answer in time.",
     507: "The disk is full.",
 }
@@ -83,10 +83,10 @@ SPECIFIC: dict[tuple[str, str], frozenset[int]] = {
     ("get", "/units/{unit_id}/images/{kind}"): frozenset({409, 504}),
     ("put", "/units/{unit_id}/images/{kind}"): frozenset({409}),
 }
-"""Beyond what follows from a route's token, parameters and body."""
+"""Refusals in addition to those that follow from a route's token, parameters and body."""
 
 COMMANDS = ("background", "calibrate", "refine")
-"""What a unit is asked for: refused when too much waits for it."""
+"""Commands to a unit: refused if too many wait for it."""
 
 BEARER: list[dict[str, list[str]]] = [{"HTTPBearer": []}]
 
@@ -94,13 +94,13 @@ BEARER: list[dict[str, list[str]]] = [{"HTTPBearer": []}]
 class ErrorAnswer(BaseModel):
     """Every refusal."""
 
-    detail: str = Field(description="One sentence that names what is wrong, what was expected and what came.")
+    detail: str = Field(description="One sentence that names the field, what was expected and what came.")
 
 
 def describe(app: FastAPI, replay: bool) -> dict[str, Any]:
-    """The OpenAPI document of the application, which takes a tenth of a second, without examples.
+    """Return the OpenAPI document of the application, without examples; this takes 0.1 s.
 
-    A replay refuses whatever would change anything.
+    A replay refuses every change.
     """
     document = get_openapi(title=app.title, version=app.version, description=TEXT, routes=app.routes)
     document["paths"]["/update"] = {"post": _update()}
@@ -125,7 +125,7 @@ def describe(app: FastAPI, replay: bool) -> dict[str, Any]:
 
 
 def illustrate(document: dict[str, Any], master: Readable) -> None:
-    """Put examples into `document` for the cell that the master watches now, in place of those of another."""
+    """Put examples for the currently watched cell into `document`, replacing those of another cell."""
     examples = Examples(master)
     for path, methods in document["paths"].items():
         for method, operation in methods.items():
@@ -140,13 +140,13 @@ def illustrate(document: dict[str, Any], master: Readable) -> None:
 
 
 class Examples:
-    """Bodies and parameters that this very master takes, as soon as its first unit has registered."""
+    """Bodies and parameters that this master accepts, once its first unit has registered."""
 
     def __init__(self, master: Readable) -> None:
         self._master = master
 
     def of_parameter(self, name: str) -> Any:
-        """What to try; None where nothing is known."""
+        """Return an example value; None if there is none."""
         document = self._master.published.document
         known: dict[str, Callable[[], Any]] = {
             "unit_id": lambda: 1,
@@ -163,7 +163,7 @@ class Examples:
         return known[name]() if name in known else None
 
     def of_body(self, method: str, path: str, media_type: str) -> dict[str, Any] | None:
-        """Named bodies; None where there is nothing to show, as of a zip."""
+        """Return named bodies; None without an example, as for a zip."""
         if media_type == MEDIA_TYPE and path == "/update":
             return {"one voxel": self._update()}
         if media_type != "application/json":
@@ -225,12 +225,12 @@ class Examples:
 
 
 def serve_documentation(app: FastAPI) -> None:
-    """`/docs` and `/redoc` out of files of our own: a cell has no internet, and no page of it asks for any."""
+    """Serve `/docs` and `/redoc` from our own files: a cell has no internet, so no page may load anything from it."""
 
     @app.get(f"{ASSETS_PATH}/{{name}}", include_in_schema=False)
     async def asset(name: str) -> Response:
         if name not in ASSET_TYPES:
-            raise Refusal(404, f"{name}: no page of the documentation needs it")
+            raise Refusal(404, f"{name}: no page of the documentation uses such a file")
         return FileResponse(ASSETS / name, media_type=ASSET_TYPES[name])
 
     @app.get("/docs", include_in_schema=False)
@@ -241,7 +241,7 @@ def serve_documentation(app: FastAPI) -> None:
             swagger_js_url=f"{ASSETS_PATH}/swagger-ui-bundle.js",
             swagger_css_url=f"{ASSETS_PATH}/swagger-ui.css",
             swagger_favicon_url=f"{ASSETS_PATH}/favicon.png",
-            # Otherwise the page has the document judged by a service on the internet.
+            # Otherwise the page sends the document to a validator on the internet.
             swagger_ui_parameters={"validatorUrl": None},
         )
 
@@ -270,7 +270,7 @@ def _refusals(method: str, path: str, operation: dict[str, Any]) -> frozenset[in
     if operation.get("parameters"):
         found.add(422)
     if method in ("post", "put"):
-        # Even without a body to take: one that came is read, and must be what it says it is.
+        # Also for routes without a body: a body that comes is read, and must match its Content-Type.
         found |= {400, 408, 413, 422}
     if path.startswith("/units/{unit_id}"):
         found.add(404)
@@ -293,8 +293,8 @@ def _update() -> dict[str, Any]:
     return {
         "tags": ["units"],
         "summary": "A unit reports its newest frame.",
-        "description": "A unit reports its newest frame; what it reported before is replaced.\n\n"
-        "msgpack both ways. The examples show the decoded map, with what travels as binary in base64.",
+        "description": "A unit reports its newest frame; its earlier report is replaced.\n\n"
+        "msgpack both ways. The examples show the decoded map, with binary fields in base64.",
         "operationId": "update_update_post",
         "security": BEARER,
         "requestBody": {
@@ -303,7 +303,7 @@ def _update() -> dict[str, Any]:
         },
         "responses": {
             "200": {
-                "description": "What the unit needs next. Fields that are at their default are left out.",
+                "description": "State that the unit needs next. Fields at their default are left out.",
                 "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/UpdateAnswer"}}},
             }
         },
@@ -311,7 +311,7 @@ def _update() -> dict[str, Any]:
 
 
 def _as_on_the_wire(schemas: dict[str, Any]) -> None:
-    """In an update and its answer rows have no names, and bytes are bytes."""
+    """Adapt the schemas to the wire: in an update and its answer, rows have no names and bytes are bytes."""
     for name in ("UpdateRequest", "UpdateAnswer"):
         properties = schemas[name]["properties"]
         for field, model in ROWS.items():

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the routes of one application work with, by names that the type checker proves."""
+"""The objects that the routes of one application use, as typed attributes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from master_server.api.history import History
-from master_server.api.image_requests import Pictures
+from master_server.api.image_requests import ImageRequests
 from master_server.api.map_stream import Stream
 from master_server.api.metrics import Metrics
 from master_server.cells.cell_loading import CellLoader
@@ -17,7 +17,7 @@ from master_server.security import Access, Limits
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Services:
-    """Of a master, or of a replay of one."""
+    """Services of a master, or of a replay."""
 
     master: Readable
     access: Access
@@ -29,10 +29,10 @@ class Services:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MasterServices(Services):
-    """Of a master: what changes it, and what units are asked for."""
+    """Services of a master: changes, and requests to units."""
 
     master: Master
     loader: CellLoader
-    pictures: Pictures
+    image_requests: ImageRequests
     metrics: Metrics
     started_at_ns: int

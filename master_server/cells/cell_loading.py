@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A new cell is read outside of the event loop, so that no unit waits for it; one at a time."""
+"""Read a new cell outside of the event loop, one at a time, so that no unit waits for it."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from shared.waiting import within
 logger = logging.getLogger(__name__)
 
 MAX_ZIP_BYTES = 128 * 2**20
-"""CAD of a whole cell at a precision that a depth camera can tell has a tenth of it."""
+"""Limit of an upload. CAD of a whole cell at the precision that a depth camera resolves takes a tenth of it."""
 
 LOAD_TIMEOUT_S = 60.0
-"""Ten times what the largest cell takes; then something is wrong with its files."""
+"""Ten times the duration of the largest cell. A longer one means that something is wrong with the files."""
 
 PLACE = Path(unpacking.__file__).resolve().parents[unpacking.__name__.count(".")]
-"""The folder of our packages: the process that unpacks a cell stands elsewhere, where nothing is installed."""
+"""Folder of our packages: the unpacking process runs in another folder, where nothing is installed."""
 
 
 class CellLoader:
@@ -40,13 +40,13 @@ class CellLoader:
 
     @contextlib.asynccontextmanager
     async def folder(self) -> AsyncIterator[Path]:
-        """A folder of its own for one cell, removed afterwards.
+        """Make a folder for one cell and remove it afterwards.
 
         Raises:
             Refusal: 409, another cell is being read.
         """
         if self._is_busy:
-            raise Refusal(409, "cell: another one is being read at this moment")
+            raise Refusal(409, "cell: another cell is being read; try again when it is done")
         self._is_busy = True
         try:
             made = await asyncio.to_thread(tempfile.TemporaryDirectory, prefix="cellwatch-cell-")
@@ -57,12 +57,12 @@ class CellLoader:
         finally:
             self._is_busy = False
 
-    async def of_zip(self, archive: Path, folder: Path) -> PublishedCell:
-        """The cell in a zip of its folder; `folder` is one of `folder()`.
+    async def load_zip(self, archive: Path, folder: Path) -> PublishedCell:
+        """Read the cell from the zip of its folder; `folder` comes from `folder()`.
 
         Raises:
-            Refusal: 422, it takes too long.
-            CellError: it is no cell; one sentence.
+            Refusal: 422, reading takes longer than LOAD_TIMEOUT_S.
+            CellError: the zip holds no valid cell; one sentence.
         """
         process = await asyncio.create_subprocess_exec(
             sys.executable,
@@ -71,7 +71,7 @@ class CellLoader:
             str(archive),
             str(folder),
             stdout=asyncio.subprocess.PIPE,
-            # Where nothing lies that could be imported in place of what is meant.
+            # An empty working directory: no module in it can shadow an installed one.
             cwd=folder,
             env={**os.environ, "PYTHONPATH": str(PLACE), "OPENBLAS_NUM_THREADS": "1"},
         )
@@ -91,14 +91,14 @@ class CellLoader:
                 await process.wait()
         if process.returncode != 0:
             reason = said.decode("utf-8", "replace").strip()
-            raise Refusal(422, reason or f"cell: reading it ended with code {process.returncode}, see the master's log")
+            raise Refusal(422, reason or f"cell: the reader ended with code {process.returncode}; see the master's log")
         return await asyncio.to_thread(_read, folder)
 
-    async def of_document(self, document: Any, current: PublishedCell) -> PublishedCell:
-        """The cell of a document whose meshes the `current` one has.
+    async def load_document(self, document: Any, current: PublishedCell) -> PublishedCell:
+        """Read the cell of a document whose meshes are in the `current` cell.
 
         Raises:
-            CellError: it is no cell; one sentence.
+            CellError: the document is no valid cell; one sentence.
         """
 
         def read() -> PublishedCell:
@@ -108,7 +108,7 @@ class CellLoader:
 
 
 def _read(folder: Path) -> PublishedCell:
-    """What the other process left."""
+    """Read the result of the other process."""
     document = json.loads((folder / unpacking.DOCUMENT).read_text(encoding="utf-8"))
     meshes = {file.name: file.read_bytes() for file in (folder / unpacking.MESHES).iterdir()}
     return PublishedCell.of(Cell.from_document(document, meshes))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cell as units and operators are given it, and what is doubtful about it."""
+"""The cell as units and operators receive it, with warnings about doubtful meshes."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from shared.transforms import Transform, apply
 logger = logging.getLogger(__name__)
 
 ABSURD_RATIO = 10.0
-"""A mesh that is longer than so many diagonals of the box: a hall around its smallest cell has half of it, and CAD in
-millimetres that is taken for metres has a thousand times its size."""
+"""Largest mesh, in diagonals of the box. A hall around the smallest cell has half of it. CAD in millimetres that is
+read as metres has a thousand times its true size."""
 
 
 @dataclass(frozen=True, eq=False)
 class PublishedCell:
-    """A cell, its document, its meshes' canonical bytes by sha256, and how it is referred to.
+    """A cell, its document, the canonical bytes of its meshes by sha256, and its reference (name and hash).
 
-    Making one of a large cell takes a while, so it is made outside of the event loop.
+    Publishing a large cell takes long, so it happens outside of the event loop.
     """
 
     cell: Cell
@@ -41,7 +41,7 @@ class PublishedCell:
         """Publish a cell.
 
         Raises:
-            CellError: one of its meshes is absurdly large and does not even touch the box.
+            CellError: a mesh is far too large and does not touch the box.
         """
         for doubt in doubts(cell):
             logger.warning("cell %s: %s", cell.name, doubt)
@@ -49,20 +49,20 @@ class PublishedCell:
         return cls(cell, document, meshes, CellReference(name=cell.name, sha256=cell.version))
 
     def with_object_pose(self, name: str, T_world_object: ArrayLike) -> PublishedCell:
-        """The same cell with one of its objects elsewhere; quick, for no mesh is touched.
+        """Return the same cell with another pose of one object. This is fast, since no mesh changes.
 
         Raises:
-            InputError: no object has this name, or the pose is no rigid transform.
+            InputError: no object has this name, or the pose is not a rigid transform.
         """
         cell = self.cell.with_object_pose(name, T_world_object)
         return PublishedCell(cell, cell.document(), self.meshes, CellReference(name=cell.name, sha256=cell.version))
 
 
 def doubts(cell: Cell) -> list[str]:
-    """A sentence for each mesh that seems to have another unit than metres.
+    """Return a sentence for each mesh whose file seems not to be in metres.
 
     Raises:
-        CellError: one of those that stand still has nothing in the box at all.
+        CellError: such a mesh belongs to a fixed body and lies completely outside of the box.
     """
     found = []
     diagonal_m = float(np.linalg.norm(cell.box_max_m - cell.box_min_m))
@@ -72,7 +72,7 @@ def doubts(cell: Cell) -> list[str]:
         if size_m <= ABSURD_RATIO * diagonal_m:
             continue
         doubt = (
-            f"{key}: its mesh is {size_m:.4g} m long in a box whose diagonal is {diagonal_m:.3g} m; "
+            f"{key}: its mesh is {size_m:.4g} m long, but the diagonal of the box is {diagonal_m:.3g} m; "
             "if its file is in millimetres, set scale: 0.001 beside mesh"
         )
         if T_world_mesh is not None and not _touches(mesh, T_world_mesh, cell.box_min_m, cell.box_max_m):
@@ -82,7 +82,7 @@ def doubts(cell: Cell) -> list[str]:
 
 
 def _bodies(cell: Cell) -> Iterator[tuple[str, TriangleMesh, Transform | None]]:
-    """Name, mesh and pose of all that is known; a robot's links have no one pose."""
+    """Yield name, mesh and pose of every known body; the pose of a robot's link is None, since it changes."""
     for body in cell.static:
         yield f"static {body.name}", body.mesh, body.T_world_mesh
     for body in cell.objects:
@@ -94,6 +94,6 @@ def _bodies(cell: Cell) -> Iterator[tuple[str, TriangleMesh, Transform | None]]:
 def _touches(
     mesh: TriangleMesh, T_world_mesh: Transform, box_min_m: NDArray[np.float64], box_max_m: NDArray[np.float64]
 ) -> bool:
-    """Whether the mesh reaches into the box, or stands around it as a hall does."""
+    """Return True if the mesh reaches into the box or surrounds it, as a hall does."""
     points_m = apply(T_world_mesh, mesh.vertices)
     return bool(((points_m.min(axis=0) <= box_max_m) & (points_m.max(axis=0) >= box_min_m)).all())

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m master_server.cells.unpacking ARCHIVE FOLDER`: a cell's folder as a zip becomes a document and its meshes.
+"""`python -m master_server.cells.unpacking ARCHIVE FOLDER`: turn the zip of a cell's folder into a document and meshes.
 
-A process of its own: reading CAD takes seconds, in which no unit may wait, and what is read came over the network. It
-opens no file outside of the cell's folder and of what Python itself is made of.
+This is a process of its own for two reasons: reading CAD takes seconds, in which no unit may wait, and the files came
+over the network. The process opens only files in the cell's folder and those that Python itself consists of.
 """
 
 from __future__ import annotations
@@ -22,31 +22,32 @@ from shared.cell import Cell
 from shared.errors import CellError, CellwatchError
 
 MAX_FILES = 4000
-"""A cell of MAX_BODIES bodies of each kind, with a robot and what CAD programs add; bounds what is made on the disk."""
+"""A cell of MAX_BODIES bodies of each kind, a robot, and additional files of CAD programs. Bounds the files on disk."""
 
 MAX_FILE_BYTES = 256 * 2**20
-"""A mesh of MAX_TRIANGLES as text; as binary STL it has a fifth of it."""
+"""A mesh of MAX_TRIANGLES as text; the same mesh as binary STL takes a fifth of it."""
 
 MAX_UNPACKED_BYTES = 512 * 2**20
-"""Of all files together: what a small disk or memory holds while a cell is read, however well it was compressed."""
+"""Bound of all files together: fits on a small disk or in memory while a cell is read, at any compression."""
 
 MAX_MEMORY_BYTES = 4 * 2**30
-"""Of this process: twenty times the largest mesh as text; a file that claims more is refused, and the master lives."""
+"""Bound of memory: twenty times the largest mesh as text. The process refuses a file that claims more, and the master
+keeps running."""
 
 CELL_FILE = "cell.yaml"
 
 REASON_CHARS = 2000
-"""Of the sentences that say what is wrong."""
+"""Longest error message."""
 
 NICENESS = 10
-"""Updates of units come first."""
+"""Niceness of this process: updates of units have priority."""
 
 DOCUMENT, MESHES = "document.json", "meshes"
-"""What is left in the folder."""
+"""Names of the results in the folder: the document, and the meshes."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; what is wrong with the cell is printed as one sentence, with exit code 1."""
+    """Run the command. Print an error in the cell as one sentence and return 1."""
     archive, folder = (Path(argument).resolve() for argument in arguments or sys.argv[1:])
     os.nice(NICENESS)
     resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY_BYTES, MAX_MEMORY_BYTES))
@@ -61,16 +62,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(reason[:REASON_CHARS])
         return 1
     except MemoryError:
-        print(f"the cell needs more than {MAX_MEMORY_BYTES >> 30} GiB of memory to be read")
+        print(f"cell: reading it needs more than {MAX_MEMORY_BYTES >> 30} GiB of memory; simplify its meshes")
         return 1
     return 0
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpack plain files within bounds.
+    """Unpack plain files within the bounds.
 
     Raises:
-        CellError: it is no zip, too large, or an entry is a link, encrypted, or would leave the folder.
+        CellError: the file is no zip, is too large, or has an entry that is a link, encrypted or outside of the folder.
     """
     try:
         with zipfile.ZipFile(archive) as packed:
@@ -81,7 +82,7 @@ def unpack(archive: Path, folder: Path) -> None:
                 if entry.is_dir():
                     continue
                 target.parent.mkdir(parents=True, exist_ok=True)
-                # No more is read than the entry claims to hold, or its checksum is wrong.
+                # Read no more than the entry claims to hold; a wrong claim makes the checksum fail.
                 with packed.open(entry) as source, target.open("wb") as copy:
                     while chunk := source.read(2**20):
                         copy.write(chunk)
@@ -92,10 +93,10 @@ def unpack(archive: Path, folder: Path) -> None:
 
 
 def cell_file_in(folder: Path) -> Path:
-    """The cell file at the root or in the one top folder.
+    """Return the cell file at the root or in the only top folder.
 
     Raises:
-        CellError: there is none, or more than one.
+        CellError: there is no such file, or more than one.
     """
     if (folder / CELL_FILE).is_file():
         return folder / CELL_FILE
@@ -107,7 +108,7 @@ def cell_file_in(folder: Path) -> Path:
 
 
 def stay_inside(folder: Path) -> None:
-    """From now on this process opens no file outside of `folder` but those that Python is made of; for good."""
+    """Bar this process for good from opening files outside of `folder`, except those that Python consists of."""
     own = {os.path.realpath(path) for path in (sys.prefix, sys.base_prefix, sys.exec_prefix, *sys.path) if path}
     roots = tuple(f"{root.rstrip('/')}/" for root in {*own, os.path.realpath(folder)})
 
@@ -122,7 +123,7 @@ def stay_inside(folder: Path) -> None:
 
 
 def write(cell: Cell, folder: Path) -> None:
-    """Leave the cell's document and meshes in `folder`.
+    """Write the cell's document and meshes to `folder`.
 
     Raises:
         CellError: the disk is full.
@@ -134,7 +135,7 @@ def write(cell: Cell, folder: Path) -> None:
             (folder / MESHES / sha256).write_bytes(data)
         (folder / DOCUMENT).write_text(json.dumps(document), encoding="utf-8")
     except OSError as error:
-        raise CellError(f"the cell cannot be kept while it is read: {error.strerror or error}") from error
+        raise CellError(f"the cell cannot be written to the disk: {error.strerror or error}") from error
 
 
 def _check_sizes(entries: Sequence[zipfile.ZipInfo]) -> None:
@@ -152,7 +153,7 @@ def _check_sizes(entries: Sequence[zipfile.ZipInfo]) -> None:
 
 
 def _place_of(entry: zipfile.ZipInfo) -> PurePosixPath:
-    """Where an entry belongs below the folder."""
+    """Return the path of an entry below the folder."""
     place = PurePosixPath(entry.filename)
     if place.is_absolute() or ".." in place.parts or "\\" in entry.filename or ":" in entry.filename:
         raise CellError(f"zip: {_shown(entry)}: expected a path inside of the folder, got one that leaves it")
@@ -165,7 +166,7 @@ def _place_of(entry: zipfile.ZipInfo) -> PurePosixPath:
 
 
 def _shown(entry: zipfile.ZipInfo) -> str:
-    """An entry's name for a message."""
+    """Return an entry's name for a message."""
     name = entry.filename[:100]
     return name if name.isprintable() else repr(name)
 

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The merge and all that it rests on, without a network.
+"""The merge and its inputs, without a network.
 
 In the order of the flow:
 
     robot_joints  the robot's joints, as a short history
-    coverage      what the units look through, united
+    coverage      the blocks that the units see, united
     merged_map    the units' voxels, merged (Algorithm 9)
-    units         the units' slots and how far each can be trusted (Algorithm 8)
-    master        all of that held together, without a network
-    ticker        its tick, by the clock
-    read_model    what readers see: a master, or a recording of one
+    units         the units' slots and the trust in each unit (Algorithm 8)
+    master        combines all of these
+    ticker        ticks the master by the clock
+    read_model    the interface of readers: a master, or a recording of one
 """
 
 from master_server.core.master import MapView, Master

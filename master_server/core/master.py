@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The master without a network: slots, merge, coverage, robot, settings and cell held together.
+"""The master without a network: slots, merge, coverage, robot, settings and cell in one place.
 
-Every call is handed the time; nothing here waits, reads a file or knows HTTP.
+Every call receives the time; nothing here waits, reads a file or knows HTTP.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from master_server.core.coverage import Coverage
 from master_server.core.merged_map import NO_KEYS, MergedMap
 from master_server.core.robot_joints import RobotJoints
 from master_server.core.units import Registry, Slot, UnitState, sentence_of
-from master_server.persistence import Store, beginning
+from master_server.persistence import Store, startup_state
 from shared.cell import Cell
 from shared.configuration import sentence
 from shared.errors import Refusal
@@ -57,10 +57,10 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class MapView:
-    """The merged map at one time: keys (N,) uint32 ascending, witnesses (N,) uint8; and whether it is all there is.
+    """The merged map at one time: keys (N,) uint32 ascending, witnesses (N,) uint8, and its gaps.
 
-    `reports` are the keys of each live unit by its id, of which it was merged; `causes` the reasons for programs, in
-    the same order (recordings of contract 5.0 have none).
+    `reports` are the keys of each live unit by its id, from which the map was merged. `causes` are the reasons for
+    programs, in the same order as `reasons` (recordings of contract 5.0 have none).
     """
 
     lattice: Lattice
@@ -75,34 +75,34 @@ class MapView:
 
     @property
     def complete(self) -> bool:
-        """Whether a voxel that is not reported, in a block that is seen, holds nothing unknown."""
+        """True if each unreported voxel in a seen block holds nothing unknown."""
         return not self.reasons
 
 
 class Master:
-    """What the master knows, and what may be asked of it."""
+    """The state of the master and all calls on it."""
 
     def __init__(self, cell: Cell, settings: Settings, store: Store | None = None) -> None:
-        """Begins where the master before it ended, by its `store`; with none, nothing outlives it.
+        """Continue from the state in `store`; without a store, no state outlives this object.
 
-        Where `cell` and `settings`, as configured, are others than were stored, `beginning` decides.
+        Where the configured `cell` and `settings` differ from the stored ones, `startup_state` decides.
 
         Raises:
             InputError: the cell needs too many voxels of the size in the settings.
             ConfigError: the store is damaged.
-            CellError: a mesh is absurdly large and does not touch the box.
-            Refusal: 507, what it begins with cannot be stored.
+            CellError: a mesh is far too large and does not touch the box.
+            Refusal: 507, the state at start cannot be stored.
         """
         self.store = Store.in_memory() if store is None else store
         saved = self.store.load()
-        begun = beginning(saved, cell, settings)
-        self.published = PublishedCell.of(begun.cell)
-        lattice = begun.cell.lattice(begun.settings.voxel_size_m)
-        if begun.is_news:
-            self.store.begin(begun.cell, begun.cell_file, begun.settings, begun.configured, begun.versions)
-        cell = begun.cell
-        self.settings = settings = begun.settings
-        self.versions = begun.versions
+        startup = startup_state(saved, cell, settings)
+        self.published = PublishedCell.of(startup.cell)
+        lattice = startup.cell.lattice(startup.settings.voxel_size_m)
+        if startup.is_changed:
+            self.store.begin(startup.cell, startup.cell_file, startup.settings, startup.configured, startup.versions)
+        cell = startup.cell
+        self.settings = settings = startup.settings
+        self.versions = startup.versions
         self.registry = Registry(self.store, saved.units, saved.last_id)
         self.robot = RobotJoints(cell.robot.joint_names if cell.robot else None)
         self.listeners: list[Callable[[], None]] = []
@@ -111,17 +111,17 @@ class Master:
 
     @property
     def cell(self) -> Cell:
-        """The cell that is watched."""
+        """The watched cell."""
         return self.published.cell
 
     # ------------------------------------------------------------------ units
 
     def initialize(self, request: InitializeRequest, ip: str, now_ns: int) -> InitializeAnswer:
-        """A unit asks for its slot (Algorithm 8).
+        """Give a unit its slot (Algorithm 8).
 
         Raises:
-            Refusal: it speaks another contract, its camera reports from elsewhere, another camera reports from
-                its IP, there are too many units, or it cannot be stored.
+            Refusal: the unit speaks another contract, its camera reports from another IP, another camera reports from
+                this IP, there are too many units, or the change cannot be stored.
         """
         if request.contract != CONTRACT_VERSION or request.contract_minor > CONTRACT_MINOR:
             first = "the master" if is_newer(request.contract, request.contract_minor) else "the unit"
@@ -150,15 +150,15 @@ class Master:
         )
 
     def update(self, update: UpdateRequest, ip: str, now_ns: int) -> UpdateAnswer:
-        """A unit reports its newest frame; what it reported before is replaced.
+        """Replace a unit's report by that of its newest frame.
 
         Raises:
-            Refusal: 404 for an unknown id, 403 for another's, 409 for an old session or sequence.
+            Refusal: 404 for an unknown id, 403 for another unit's id, 409 for an old session or sequence.
             WireError: keys or seen report are malformed; nothing was changed.
         """
         slot = self.registry.own(update.id, ip)
         if update.session != slot.session.number:
-            raise Refusal(409, f"unit {slot.id}: this session is over, initialize again")
+            raise Refusal(409, f"unit {slot.id}: its session has expired; initialize again")
         before = slot.session.sequence
         if update.sequence <= before:
             raise Refusal(409, f"unit {slot.id}: expected a sequence above {before}, got {update.sequence}")
@@ -167,7 +167,7 @@ class Master:
         if update.seen is not None and update.versions == self._versions_for(slot):
             self.coverage.report(slot.id, update.seen)
         self.map.replace(slot.id, keys)
-        slot.session.take_in(update, now_ns)
+        slot.session.store_update(update, now_ns)
         for ended in update.done:
             slot.end(ended.id, ended.outcome)
         self._notice(slot, now_ns)
@@ -175,19 +175,19 @@ class Master:
         return self._answer(slot, update, now_ns)
 
     def judge(self, slot: Slot, now_ns: int) -> tuple[State, Reason | None]:
-        """A unit's state now, and why."""
+        """Return a unit's state now, and the reason."""
         return slot.judge(now_ns, self.versions, self.settings)
 
     def tick(self, now_ns: int) -> None:
-        """Notice what time alone changed: log units whose state is another one, end commands that were not answered.
+        """Notice changes by time alone: log each unit whose state changed, and end commands that were not answered.
 
-        No answer waits for it: each is of its own `now_ns`.
+        Answers do not depend on it: each is computed for its own `now_ns`.
         """
         for slot in self.registry:
             self._notice(slot, now_ns)
 
     def units(self, now_ns: int) -> list[UnitRow]:
-        """One row a unit."""
+        """Return one row for each unit."""
         rows = []
         for slot in self.registry:
             pose = slot.T_world_camera
@@ -198,7 +198,7 @@ class Master:
         return rows
 
     def unit_states(self, now_ns: int) -> list[UnitState]:
-        """Of each row what a stream tells at every change."""
+        """Return the part of each row that a stream sends at every change."""
         rows = []
         for slot in self.registry:
             state, cause = self.judge(slot, now_ns)
@@ -209,10 +209,10 @@ class Master:
         return rows
 
     def forget(self, unit_id: int) -> None:
-        """Delete a unit. If it still runs it comes back, as a new one.
+        """Delete a unit. If it still runs it comes back as a new one.
 
         Raises:
-            Refusal: 404, there is none; 507, it cannot be stored.
+            Refusal: 404, the unit is unknown; 507, the change cannot be stored.
         """
         self.registry.remove(unit_id)
         self._withdraw(unit_id)
@@ -226,11 +226,11 @@ class Master:
         ip: str | None,
         quality: PoseQuality | None = None,
     ) -> int:
-        """A camera's pose is known, by whatever means; returns its version. `ip` is the caller's, if it is a unit.
+        """Set a camera's pose from any origin and return its version. `ip` is the caller's, if the caller is a unit.
 
         Raises:
-            Refusal: 404, there is no such unit; 403, it is another's; 507, it cannot be stored.
-            InputError: the pose is no rigid transform.
+            Refusal: 404, the unit is unknown; 403, the unit is not the caller's; 507, the pose cannot be stored.
+            InputError: the pose is not a rigid transform.
         """
         slot = self.registry.get(unit_id) if ip is None else self.registry.own(unit_id, ip)
         pose = matrix_of(validated(T_world_camera, "T_world_camera"))
@@ -240,18 +240,18 @@ class Master:
         logger.info("unit %d (%s): its pose is set (%s)", slot.id, slot.ip, origin, extra=slot.log_fields("pose"))
         return slot.pose_version
 
-    def ask(self, unit_id: int, verb: Verb, now_ns: int) -> Command:
-        """Have a unit do something.
+    def send_command(self, unit_id: int, verb: Verb, now_ns: int) -> Command:
+        """Send a command to a unit.
 
         Raises:
-            Refusal: 404, there is none; 409, too much waits for it.
+            Refusal: 404, the unit is unknown; 409, too many commands wait for it.
         """
-        return self.registry.ask(self.registry.get(unit_id), verb, now_ns)
+        return self.registry.send_command(self.registry.get(unit_id), verb, now_ns)
 
-    # ------------------------------------------------------------------ what everyone asks
+    # ------------------------------------------------------------------ map and changes
 
     def view(self, now_ns: int) -> MapView:
-        """The union of what live units report, and what it lacks (Algorithm 9)."""
+        """Return the union of the live units' reports, and the reasons if it is incomplete (Algorithm 9)."""
         causes: list[Reason] = []
         live: list[int] = []
         oldest_s: float | None = None
@@ -285,15 +285,15 @@ class Master:
         )
 
     def seen_by(self, now_ns: int) -> NDArray[np.uint8]:
-        """How many live units look through each block, in the shape of `coverage.blocks`."""
+        """Return the number of live units that see each block, in the shape of `coverage.blocks`."""
         return self.coverage.seen_by(slot.id for slot in self.registry if self.judge(slot, now_ns)[0] == "live")
 
     def blocks_at(self, now_ns: int) -> Lattice:
-        """The blocks that `seen_by` counts in."""
+        """Return the blocks of `seen_by`."""
         return self.coverage.blocks
 
     def next_change_ns(self, now_ns: int) -> int | None:
-        """The time after which a unit or the robot is stale if it stays silent; the first of them, None without any."""
+        """Return the first time at which a unit or the robot becomes stale without a new report; None without any."""
         moments = [slot.session.expires_at_ns(self.settings.stale_after_s) for slot in self.registry]
         moments.append(self.robot.expires_at_ns(self.settings.robot_stale_after_s))
         return min((moment for moment in moments if moment is not None and moment >= now_ns), default=None)
@@ -301,14 +301,14 @@ class Master:
     # ------------------------------------------------------------------ robot
 
     def put_joints(self, request: JointsRequest, now_ns: int) -> None:
-        """The robot tells where it is; raises as `RobotJoints.put`."""
+        """Store the robot's joints; raises as `RobotJoints.put`."""
         was_fresh = self.robot.state(now_ns, self.settings.robot_stale_after_s)[0] == "fresh"
         self.robot.put(request, now_ns)
         if not was_fresh:
             self._changed()
 
     def robot_answer(self, since_ns: int | None, now_ns: int) -> RobotAnswer:
-        """The newest joints, or all after `since_ns`."""
+        """Return the newest joints, or all after `since_ns`."""
         state, cause = self.robot.state(now_ns, self.settings.robot_stale_after_s)
         age_s = self.robot.age_s(now_ns)
         newest = self.robot.newest
@@ -322,14 +322,14 @@ class Master:
             joints=samples,
         )
 
-    # ------------------------------------------------------------------ what an operator changes
+    # ------------------------------------------------------------------ changes by an operator
 
     def change_settings(self, changes: Mapping[str, object]) -> Settings:
-        """Change some settings; the others stay. Every unit has them with the answer to its next update.
+        """Change some settings; the others stay. Every unit receives them with the answer to its next update.
 
         Raises:
-            Refusal: 422, a name is unknown or a value out of range; 507, it cannot be stored.
-            InputError: the cell would need too many voxels of that size; nothing was changed.
+            Refusal: 422, a name is unknown or a value out of range; 507, the change cannot be stored.
+            InputError: the cell would need too many voxels of that size; nothing is changed.
         """
         try:
             settings = Settings.model_validate({**self.settings.model_dump(), **changes})
@@ -353,15 +353,15 @@ class Master:
         return settings
 
     def change_cell(self, cell: Cell | PublishedCell) -> CellAnswer:
-        """Watch another cell from now on. Every unit learns of it with the answer to its next update, and is not live
-        until it works with it.
+        """Watch another cell. Every unit learns of it with the answer to its next update. The unit is not live until it
+        works with that cell.
 
         The robot's joints are kept if the robot is the same.
 
         Raises:
             InputError: the cell would need too many voxels; the old one stays.
-            CellError: a mesh is absurdly large and does not touch the box; the old one stays.
-            Refusal: 507, it cannot be stored; the old one stays.
+            CellError: a mesh is far too large and does not touch the box; the old one stays.
+            Refusal: 507, the cell cannot be stored; the old one stays.
         """
         published = cell if isinstance(cell, PublishedCell) else PublishedCell.of(cell)
         lattice = published.cell.lattice(self.settings.voxel_size_m)
@@ -379,18 +379,18 @@ class Master:
             robot = published.cell.robot
             self.robot = RobotJoints(robot.joint_names if robot else None)
         self.published, self.versions = published, versions
-        # Whatever was reported was made with the old cell.
+        # All reports were made with the old cell.
         self._begin_on(lattice, blocks)
         logger.info("cell %s: version %d, %s", published.cell.name, self.versions.cell, published.reference.sha256[:8])
         self._changed()
         return self.cell_answer
 
     def move_object(self, name: str, T_world_object: Matrix) -> CellAnswer:
-        """A known object stands elsewhere from now on; otherwise as `change_cell`.
+        """Set the pose of a known object; otherwise as `change_cell`.
 
         Raises:
-            Refusal: 404, no object has this name; 507, it cannot be stored.
-            InputError: the pose is no rigid transform.
+            Refusal: 404, no object has this name; 507, the change cannot be stored.
+            InputError: the pose is not a rigid transform.
         """
         names = [body.name for body in self.cell.objects]
         if name not in names:
@@ -399,7 +399,7 @@ class Master:
 
     @property
     def cell_answer(self) -> CellAnswer:
-        """Which cell is watched now."""
+        """Return the name and the version of the watched cell."""
         return CellAnswer(cell=self.published.reference, versions=self.versions)
 
     # ------------------------------------------------------------------ inside
@@ -409,7 +409,7 @@ class Master:
             listener()
 
     def _begin_on(self, lattice: Lattice, blocks: Lattice) -> None:
-        """Begin on another lattice and blocks; all that was reported is void."""
+        """Start with another lattice and blocks; all reports are dropped."""
         self.lattice = lattice
         self.lattice_description = LatticeDescription.of(self.lattice)
         self.map = MergedMap(self.lattice)
@@ -420,11 +420,11 @@ class Master:
         self.coverage.withdraw(unit_id)
 
     def _notice(self, slot: Slot, now_ns: int) -> None:
-        if slot.asked:
+        if slot.pending:
             slot.expire(now_ns)
         state, cause = self.judge(slot, now_ns)
-        if state != slot.told_state:
-            slot.tell(state, cause)
+        if state != slot.logged_state:
+            slot.log_state(state, cause)
 
     def _answer(self, slot: Slot, update: UpdateRequest, now_ns: int) -> UpdateAnswer:
         current, theirs = self._versions_for(slot), update.versions
@@ -452,5 +452,5 @@ class Master:
 
 
 def _of_unit(slot: Slot, code: ReasonCode, what: str, numbers: Mapping[str, float] | None = None) -> Reason:
-    """A reason that is about one unit."""
+    """Return a reason that concerns one unit."""
     return Reason(code, f"unit {slot.id} ({slot.ip}) {what}", {"unit": float(slot.id), **(numbers or {})})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What those who only read ask of: a master, or a recording of one."""
+"""The interface that readers use: a master, or a recording of one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from shared.settings import Settings
 
 
 class ReadableCell(Protocol):
-    """The part of `PublishedCell` that units and readers are given."""
+    """The part of `PublishedCell` that units and readers receive."""
 
     @property
     def reference(self) -> CellReference: ...
@@ -30,7 +30,7 @@ class ReadableCell(Protocol):
 
 
 class Readable(Protocol):
-    """The part of `Master` that changes nothing; each member as it is there."""
+    """The part of `Master` that changes nothing; each member is documented there."""
 
     listeners: list[Callable[[], None]]
 

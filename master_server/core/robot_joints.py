@@ -1,26 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot's joints as a short history, so that every unit finds those of its own frame's time."""
+"""A short history of the robot's joints. Each unit finds the joints at the time of its own frame in it."""
 
 from __future__ import annotations
 
 from collections import deque
 from itertools import takewhile
-from typing import Literal
 
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.errors import Refusal
-from shared.messages import MAX_JOINT_SAMPLES, JointSample, JointsRequest, Reason
+from shared.messages import MAX_JOINT_SAMPLES, JointSample, JointsRequest, Reason, RobotState
 
 HISTORY_SAMPLES = 2048
-"""Four seconds of a robot that reports at 500 Hz; no unit's frame is older when it is still of use."""
+"""Four seconds of a robot that reports at 500 Hz; older frames of a unit are of no use."""
 
 FUTURE_TOLERANCE_NS = 20 * NS_PER_MS
-"""A driver on another machine has estimated the master's clock; this is how wrong it may be."""
+"""Tolerated error of the master's clock as a driver on another machine estimates it."""
 
 ANSWER_SPACING_NS = 8 * NS_PER_MS
-"""At 40 rad/s2, linear interpolation over 8 ms is wrong by 0.3 mrad: denser samples tell a unit nothing more."""
-
-RobotState = Literal["fresh", "stale", "silent", "none"]
+"""At 40 rad/s2, linear interpolation over 8 ms is wrong by 0.3 mrad: denser samples do not help a unit."""
 
 
 class RobotJoints:
@@ -32,13 +29,13 @@ class RobotJoints:
         self._history: deque[JointSample] = deque(maxlen=HISTORY_SAMPLES)
 
     def put(self, request: JointsRequest, now_ns: int) -> JointSample:
-        """Take in where the robot is.
+        """Store a joint sample.
 
         Raises:
-            Refusal: 404 without a robot in the cell, 422 for a wrong count or a time to come, 409 for one gone by.
+            Refusal: 404 without a robot in the cell, 422 for a wrong count or a future time, 409 for an old time.
         """
         if self.joint_names is None:
-            raise Refusal(404, "robot: this cell has none")
+            raise Refusal(404, "robot: the cell has no robot")
         count = len(self.joint_names)
         for name, values in (("positions", request.positions), ("velocities", request.velocities)):
             if values is not None and len(values) != count:
@@ -56,11 +53,11 @@ class RobotJoints:
 
     @property
     def newest(self) -> JointSample | None:
-        """The latest sample, if there is any."""
+        """Return the latest sample; None without one."""
         return self._history[-1] if self._history else None
 
     def since(self, until_ns: int) -> tuple[JointSample, ...]:
-        """What a unit lacks that has all up to `until_ns`: oldest first, thinned, always with the newest."""
+        """Return the samples after `until_ns`: oldest first, thinned, always including the newest."""
         picked: list[JointSample] = []
         for sample in takewhile(lambda sample: sample.at_ns > until_ns, reversed(self._history)):
             if not picked or picked[-1].at_ns - sample.at_ns >= ANSWER_SPACING_NS:
@@ -70,17 +67,17 @@ class RobotJoints:
         return tuple(reversed(picked))
 
     def age_s(self, now_ns: int) -> float | None:
-        """Seconds since the newest sample's time."""
+        """Return the seconds since the newest sample's time; None without one."""
         newest = self.newest
         return None if newest is None else (now_ns - newest.at_ns) / NS_PER_S
 
     def expires_at_ns(self, stale_after_s: float) -> int | None:
-        """When the newest sample becomes too old; None without one."""
+        """Return the time at which the newest sample is stale; None without one."""
         newest = self.newest
         return None if newest is None else newest.at_ns + round(stale_after_s * NS_PER_S)
 
     def state(self, now_ns: int, stale_after_s: float) -> tuple[RobotState, Reason | None]:
-        """Whether units can filter the robot, and why not."""
+        """Return the robot's state, and the reason if units cannot filter the robot."""
         if self.joint_names is None:
             return "none", None
         age_s = self.age_s(now_ns)

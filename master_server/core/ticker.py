@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A master's tick by the clock: what time alone changes is noticed soon, though nobody reports and nobody asks."""
+"""Tick a master by the clock, so that it notices what time alone changes without an update or a request."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from shared.clock import NS_PER_MS
 from shared.waiting import Clock, LoopClock, Timer
 
 TICK_NS = 25 * NS_PER_MS
-"""Half of the shortest `stale_after_s`; with 50 units a tick takes some 0.1 ms."""
+"""Half of the shortest `stale_after_s`; with 50 units a tick takes about 0.1 ms."""
 
 
 class Ticker:
     """Ticks one master every `TICK_NS`."""
 
     def __init__(self, master: Master, clock: Clock | None = None) -> None:
-        """`clock` is that of the running event loop by default."""
+        """By default, `clock` is that of the running event loop."""
         self._master = master
         self._clock = LoopClock() if clock is None else clock
         self._timer: Timer | None = None
 
     def start(self) -> None:
-        """Tick from now on."""
+        """Start ticking."""
         self._tick()
 
     def stop(self) -> None:
-        """Tick no more."""
+        """Stop ticking."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
     def _tick(self) -> None:
         now_ns = self._clock.now_ns()
-        # First of all, so that even a fault below only costs this one tick.
+        # Schedule the next tick first: a fault below then costs only this tick.
         self._timer = self._clock.call_at(now_ns + TICK_NS, self._tick)
         self._master.tick(now_ns)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The units' slots (Algorithm 8), and how far each unit can be trusted now."""
+"""The units' slots (Algorithm 8), and the trust in each unit's current report."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.errors import Refusal
 from shared.messages import (
     MAX_COMMANDS,
+    OPEN,
     Command,
     CommandRow,
     Health,
@@ -45,59 +46,59 @@ from shared.transforms import angle_rad, inverse
 logger = logging.getLogger(__name__)
 
 MAX_UNITS = 64
-"""More cameras than any cell that we heard of has; bounds the tables, and the witnesses of a voxel."""
+"""More cameras than in any cell known to us; bounds the tables, and the witnesses of a voxel."""
 
 assert MAX_UNITS <= MAX_WITNESSES
 
 REFINED_MM, REFINED_DEG = 100.0, 5.0
-"""A pose that was refined lies this near to the one that a unit was told: as far as units refine."""
+"""A refined pose differs at most this much from the unit's configured pose: refinement goes no farther."""
 
 FPS_FRAMES = 31
-"""Frames over which the frame rate is taken: two seconds at 15 fps."""
+"""Frames over which the frame rate is computed: two seconds at 15 fps."""
 
 FUTURE_TOLERANCE_NS = 5 * NS_PER_MS
-"""A capture may seem this much later than now beyond what the clock's uncertainty explains."""
+"""A capture time may lie this far in the future, beyond the uncertainty of the clock."""
 
 BLIND_VALID_SHARE = 0.05
 """A covered lens measures nothing; the emptiest honest view of a cell still measures a fifth of its pixels."""
 
 MOVED_AGREEING_SHARE = 0.1
-"""A camera that was turned agrees with its static surfaces by chance only; a crowd before it hides less."""
+"""A camera that was turned agrees with its static surfaces only by chance; a crowd in front of it hides less."""
 
 MOVED_STATIC_SHARE = 0.1
-"""With fewer pixels before known surfaces there is nothing to tell a moved camera by."""
+"""With fewer pixels on known surfaces, a moved camera cannot be detected."""
 
 SILENT: tuple[ReasonCode, ...] = ("no_update", "late_update")
-"""Nothing is heard of the unit: what it said before counts for nothing."""
+"""The unit is silent: its earlier report does not count."""
 
 COMMAND_EXPIRES_S = 600.0
-"""Learning the background at one frame a second takes minutes; what is not answered after ten of them never will be."""
+"""Learning the background at one frame a second takes minutes; without an answer after ten, none will come."""
 
-TOLD_ORIGINS = ("configured", "source")
-"""Of poses that the unit itself was told: it may tell another one later. What was measured or set here stays."""
+CONFIGURED_ORIGINS = ("configured", "source")
+"""Origins of poses in the unit's configuration: a later one replaces them. A pose measured or set here stays."""
 
 IMAGE_EXPIRES_S = 5.0
-"""The unit needs one frame and one update for it; whoever waits in front of a browser has lost patience by then."""
+"""The unit needs one frame and one update for it; a user in front of a browser waits no longer."""
 
 
 @dataclass(frozen=True)
 class UnitState:
     """One unit in a message of the stream."""
 
-    # Readers pass over what a later master tells besides, also within a message that forbids it.
+    # Readers ignore fields that a later master adds, also in a message that forbids extra fields.
     __pydantic_config__ = ConfigDict(extra="ignore")
 
     id: int
     ip: str
-    state: State
+    state: Annotated[State, OPEN]
     reason: str
     cause: Annotated[Reason | None, Field(description="The reason for programs.")]
-    age_s: Annotated[float | None, Field(description="Since the capture of its last frame.")]
+    age_s: Annotated[float | None, Field(description="Seconds since the capture of its last frame.")]
     voxels: int
 
 
 @dataclass
-class _Asked:
+class _PendingCommand:
     """A command that the unit has not answered yet."""
 
     command: Command
@@ -106,20 +107,20 @@ class _Asked:
 
     @property
     def unanswered(self) -> Outcome:
-        """What becomes of it when the unit does not answer in time."""
+        """Return the outcome of a command that the unit did not answer in time."""
         limit_s = IMAGE_EXPIRES_S if self.command.verb == "image" else COMMAND_EXPIRES_S
         return Outcome("unanswered", f"the unit did not answer within {limit_s:g} s")
 
 
 @dataclass
 class Session:
-    """What a unit said since it registered. Times of the unit are by the unit's clock."""
+    """The unit's reports since it registered. Times of the unit are by the unit's clock."""
 
-    told_pose: Matrix | None = None
+    configured_pose: Matrix | None = None
     registered: bool = False
     phase: Phase = "registering"
     versions: Versions = field(default_factory=Versions)
-    # Random, so that a session of a master before this one is never mistaken for a current one.
+    # Random, so that a session of an earlier master is never mistaken for a current one.
     number: int = field(default_factory=lambda: secrets.randbits(32))
     sequence: int = -1
     clock: ClockOffset = field(default_factory=ClockOffset)
@@ -129,8 +130,8 @@ class Session:
     health: Health = field(default_factory=Health)
     contract_minor: int | None = None
 
-    def take_in(self, update: UpdateRequest, now_ns: int) -> None:
-        """The unit's newest update, which arrived at `now_ns`."""
+    def store_update(self, update: UpdateRequest, now_ns: int) -> None:
+        """Store the unit's newest update, which arrived at `now_ns`."""
         self.sequence = update.sequence
         self.arrived_at_ns = now_ns
         self.versions = update.versions
@@ -143,34 +144,34 @@ class Session:
         self.captured_at_ns = update.captured_at_ns
 
     def age_s(self, now_ns: int) -> float | None:
-        """Seconds from the last frame's capture to the master's `now_ns`; None while it cannot be told."""
+        """Return the seconds from the last frame's capture to the master's `now_ns`; None while unknown."""
         if self.captured_at_ns is None or not self.clock.known:
             return None
         return (now_ns - self.captured_at_ns - self.clock.offset_ns) / NS_PER_S
 
     def arrival_age_s(self, now_ns: int) -> float | None:
-        """Seconds since an update arrived."""
+        """Return the seconds since an update arrived."""
         return None if self.arrived_at_ns is None else (now_ns - self.arrived_at_ns) / NS_PER_S
 
     def is_silent(self, now_ns: int, after_s: float) -> bool:
-        """Whether no update came for `after_s`."""
+        """Return True if no update came for `after_s`."""
         arrival_age_s = self.arrival_age_s(now_ns)
         return arrival_age_s is None or arrival_age_s > after_s
 
     def expires_at_ns(self, stale_after_s: float) -> int | None:
-        """When, by the master's clock, its last view becomes too old; None while it has none."""
+        """Return the time, by the master's clock, at which its last view is stale; None without a view."""
         if self.arrived_at_ns is None or self.captured_at_ns is None or not self.clock.known:
             return None
         newest_ns = min(self.arrived_at_ns, self.captured_at_ns + self.clock.offset_ns)
         return newest_ns + round(stale_after_s * NS_PER_S)
 
     def clock_uncertainty_ns(self, now_ns: int) -> int | None:
-        """How far `age_s` may be off."""
+        """Return the uncertainty of `age_s`."""
         return self.clock.uncertainty_ns(now_ns - self.clock.offset_ns) if self.clock.known else None
 
     @property
     def fps(self) -> float:
-        """Frames a second, over the last few."""
+        """Return the frames per second over the last few frames."""
         captures = self.captures_ns
         if len(captures) < 2 or captures[-1] <= captures[0]:
             return 0.0
@@ -179,14 +180,14 @@ class Session:
 
 @dataclass
 class Slot:
-    """What the master knows of the one camera behind an IP, but for what it reports: `MergedMap` and `Coverage`."""
+    """All state of the one camera behind an IP, except its reports, which `MergedMap` and `Coverage` hold."""
 
     record: UnitRecord
     session: Session = field(default_factory=Session)
     warning: str = ""
-    asked: deque[_Asked] = field(default_factory=deque)
+    pending: deque[_PendingCommand] = field(default_factory=deque)
     last_command: CommandRow | None = None
-    told_state: State | None = None
+    logged_state: State | None = None
     updates: int = 0
     received_bytes: int = 0
 
@@ -196,26 +197,26 @@ class Slot:
     pose_version: int = field(init=False)
 
     def __post_init__(self) -> None:
-        self.become(self.record)
+        self.set_record(self.record)
 
-    def become(self, record: UnitRecord) -> None:
-        """What is kept of it is this from now on."""
+    def set_record(self, record: UnitRecord) -> None:
+        """Replace the stored record of the slot."""
         self.record = record
-        # Each update asks for these.
+        # Cached, since each update needs these.
         self.id, self.ip = record.id, record.ip
         self.T_world_camera, self.pose_version = record.T_world_camera, record.pose_version
-        self.warning = _pose_warning(record, self.session.told_pose)
+        self.warning = _pose_warning(record, self.session.configured_pose)
 
-    def begin_session(self, told_pose: Matrix | None, contract_minor: int | None = None) -> None:
-        """The unit registered; whatever it said before is void."""
+    def begin_session(self, configured_pose: Matrix | None, contract_minor: int | None = None) -> None:
+        """Start a session for the unit that registered; all of its earlier reports are void."""
         self.session = Session(
-            told_pose,
+            configured_pose,
             registered=True,
             phase="fetching",
             versions=self.session.versions,
             contract_minor=contract_minor,
         )
-        self.warning = _pose_warning(self.record, told_pose)
+        self.warning = _pose_warning(self.record, configured_pose)
 
     @property
     def serial(self) -> str:
@@ -224,21 +225,21 @@ class Slot:
 
     @property
     def commands(self) -> tuple[Command, ...]:
-        """What the unit was asked and did not answer yet, the oldest first."""
-        return tuple(asked.command for asked in self.asked)
+        """Commands that the unit has not answered yet, the oldest first."""
+        return tuple(entry.command for entry in self.pending)
 
     def expire(self, now_ns: int) -> None:
-        """Give up what the unit did not answer in its time."""
-        for asked in self._overdue(now_ns):
-            self.end(asked.command.id, asked.unanswered)
+        """End the commands that the unit did not answer in time."""
+        for entry in self._overdue(now_ns):
+            self.end(entry.command.id, entry.unanswered)
 
     def end(self, command_id: int, outcome: Outcome) -> None:
-        """A command came to an end; harmless when it had before."""
-        for asked in [asked for asked in self.asked if asked.command.id == command_id]:
-            self.asked.remove(asked)
-            if asked.on_end is not None:
-                asked.on_end(outcome)
-            verb = asked.command.verb
+        """End a command; does nothing if it had ended before."""
+        for entry in [entry for entry in self.pending if entry.command.id == command_id]:
+            self.pending.remove(entry)
+            if entry.on_end is not None:
+                entry.on_end(outcome)
+            verb = entry.command.verb
             level = logging.DEBUG if verb == "image" else logging.INFO
             fields = {**self.log_fields("command"), "verb": verb, "code": outcome.code}
             gained = f": {outcome.detail}" if outcome.code == "done" and outcome.detail else ""
@@ -256,32 +257,32 @@ class Slot:
             if self.last_command is not None and self.last_command.id == command_id:
                 self.last_command = self.last_command.ended(outcome)
 
-    def tell(self, state: State, cause: Reason | None) -> None:
-        """Log that its state is another one."""
+    def log_state(self, state: State, cause: Reason | None) -> None:
+        """Log a change of its state."""
         reason = sentence_of(cause)
         level = logging.INFO if state == "live" else logging.WARNING
-        before = f"{self.told_state} → " if self.told_state else ""
+        before = f"{self.logged_state} → " if self.logged_state else ""
         why = f": {reason}" if reason else ""
         fields = {**self.log_fields("state"), "state": state, "reason": reason, "code": cause.code if cause else ""}
         logger.log(level, "unit %d (%s): %s%s%s", self.id, self.ip, before, state, why, extra=fields)
-        self.told_state = state
+        self.logged_state = state
 
     def log_fields(self, event: str) -> dict[str, object]:
-        """What a line of the log about it carries besides its text."""
+        """Return the structured fields of a log line about this unit."""
         return {"event": event, "unit_id": self.id, "ip": self.ip}
 
     def judge(self, now_ns: int, current: Versions, settings: Settings) -> tuple[State, Reason | None]:
-        """The unit's state, and the reason when it is not live, or a warning when it is.
+        """Return the unit's state, and the reason if it is not live, or a warning if it is.
 
-        `current` has the versions of the master; its pose counts for nothing, each slot has its own.
+        `current` has the versions of the master; its pose version is not used, since each slot has its own.
         """
         if self.T_world_camera is None:
             return "uncalibrated", self._without_pose()
         if stale := self._stale(now_ns, current, settings):
-            return "stale", self._with_trouble(stale)
+            return "stale", self._with_reported_trouble(stale)
         health = self.session.health
         if health.trouble:
-            return "blind", self._trouble(health.trouble)
+            return "blind", self._with_progress(health.trouble)
         if health.blind:
             return "blind", Reason("covered", health.blind)
         if health.valid_share < BLIND_VALID_SHARE:
@@ -300,7 +301,7 @@ class Slot:
         return "live", Reason("warning", health.warning) if health.warning else None
 
     def row(self, now_ns: int, state: State, cause: Reason | None, voxels: int, range_m: float | None) -> UnitRow:
-        """What `GET /units` tells."""
+        """Return its row of `GET /units`."""
         session = self.session
         age_s, arrival_age_s = session.age_s(now_ns), session.arrival_age_s(now_ns)
         uncertainty_ns = session.clock_uncertainty_ns(now_ns)
@@ -333,33 +334,33 @@ class Slot:
         )
 
     def _last_command(self, now_ns: int) -> CommandRow | None:
-        """The last command, with what became of it by `now_ns`, whether or not that was noticed yet."""
+        """Return the last command with its outcome at `now_ns`, even if `tick` has not noticed that outcome yet."""
         last = self.last_command
-        for asked in self._overdue(now_ns):
-            if last is not None and last.id == asked.command.id:
-                return last.ended(asked.unanswered)
+        for entry in self._overdue(now_ns):
+            if last is not None and last.id == entry.command.id:
+                return last.ended(entry.unanswered)
         return last
 
-    def _overdue(self, now_ns: int) -> list[_Asked]:
-        return [asked for asked in self.asked if asked.expires_at_ns <= now_ns]
+    def _overdue(self, now_ns: int) -> list[_PendingCommand]:
+        return [entry for entry in self.pending if entry.expires_at_ns <= now_ns]
 
     def _without_pose(self) -> Reason:
-        """Why it is not known where its camera is."""
+        """Return the reason why the pose of its camera is unknown."""
         if self.record.note:
             is_old = self.session.health.trouble_code == "contract"
             return Reason("contract" if is_old else "pose_void", self.record.note)
         if self.session.health.trouble:
-            return self._trouble(self.session.health.trouble)
+            return self._with_progress(self.session.health.trouble)
         return Reason("no_pose", "its pose is not known yet")
 
-    def _trouble(self, sentence: str) -> Reason:
-        """What the unit says is wrong, and how far it is with what is to be waited for."""
+    def _with_progress(self, sentence: str) -> Reason:
+        """Return the trouble that the unit reports, with its progress if it is one that passes."""
         progress = self.session.health.progress
         numbers = {"done": float(progress.done), "total": float(progress.total)} if progress else {}
         return Reason(self.session.health.trouble_code or "trouble", sentence, numbers)
 
-    def _with_trouble(self, stale: Reason) -> Reason:
-        """The same with what the unit said was wrong; one that does not understand its master is not merely late."""
+    def _with_reported_trouble(self, stale: Reason) -> Reason:
+        """Add the unit's reported trouble to a reason; a unit of an older contract is not merely late."""
         trouble = self.session.health.trouble
         if not trouble:
             return stale
@@ -367,7 +368,7 @@ class Slot:
         return Reason("contract" if is_old else stale.code, f"{stale.sentence} ({trouble})", stale.numbers)
 
     def _stale(self, now_ns: int, current: Versions, settings: Settings) -> Reason | None:
-        """Why its last view says nothing about now; None when it does."""
+        """Return the reason why its last view does not count now; None if it does."""
         limit_s = settings.stale_after_s
         session = self.session
         arrival_age_s, age_s = session.arrival_age_s(now_ns), session.age_s(now_ns)
@@ -405,10 +406,10 @@ class Slot:
 
 
 class Registry:
-    """All slots: one for each IP, allocated once. What changes of them is stored before it counts."""
+    """All slots, one for each IP, allocated once. Each change is stored before it takes effect."""
 
     def __init__(self, store: Store, units: Iterable[UnitRecord] = (), last_id: int = 0) -> None:
-        """With the `units` of before, and the last id that was ever given."""
+        """Start with the stored `units`, and the last id that was ever given."""
         self._store = store
         self._slots = {unit.id: Slot(unit) for unit in units}
         self._by_ip = {slot.ip: slot for slot in self._slots.values()}
@@ -424,18 +425,18 @@ class Registry:
     def initialize(
         self, request: InitializeRequest, ip: str, now_ns: int, stale_after_s: float
     ) -> tuple[Slot, list[Slot]]:
-        """The slot of this IP with a new session, and the slots that were retired for it.
+        """Return the slot of this IP with a new session, and the slots that were retired for it.
 
-        A camera that turns up behind another IP retires its old slot, once that is silent for `stale_after_s`:
-        two cameras of one serial would otherwise evict each other for ever, as would two cameras behind one IP. Its
-        pose moves along only within one boot of the unit, for then merely the address changed. Another camera in a
-        slot voids the pose. A pose that the unit was told replaces none but one that a unit was told before.
-        Where a camera takes the slot of another, that one is expected in its old slot instead of being forgotten:
-        units that exchanged addresses come one after the other, and one that does not come back must be missed.
+        A camera that appears behind another IP retires its old slot once that is silent for `stale_after_s`. Without
+        this delay, two cameras of one serial would evict each other for ever, and so would two cameras behind one IP.
+        Its pose moves with it only within one boot of the unit, since then only the address changed. Another camera in
+        a slot makes the pose void. A pose from the unit's configuration replaces only a pose of that origin. A camera
+        that takes the slot of another does not delete the other: that one is expected in the old slot of the first.
+        Units that exchanged addresses come one after the other, and one that does not come back must be missed.
 
         Raises:
-            Refusal: 409, the camera reports from another IP right now, or another camera from this one; 503, there
-                are MAX_UNITS already; 507, it cannot be stored.
+            Refusal: 409, the camera reports from another IP now, or another camera from this IP; 503, there are
+                MAX_UNITS already; 507, the change cannot be stored.
         """
         elsewhere = [slot for slot in self if slot.serial == request.serial and slot.ip != ip]
         for old in elsewhere:
@@ -453,14 +454,14 @@ class Registry:
         record = _registered(request, ip, self._last_id + 1 if slot is None else slot.record, elsewhere)
         moved = elsewhere[:1] if slot is not None and slot.serial != request.serial else []
         retired = elsewhere[len(moved) :]
-        left = [_expecting(old.record, slot.record, ip) for old in moved if slot is not None]
+        left = [_expected_elsewhere(old.record, slot.record, ip) for old in moved if slot is not None]
         if slot is None or elsewhere or record != slot.record:
             try:
                 self._store.save_units([record, *left], [old.id for old in retired])
             except Refusal:
                 if slot is None or elsewhere or record.pose_version != slot.pose_version:
                     raise
-                # Only its software or its boot is another, for which no view of the cell is given up.
+                # Only its software or its boot changed, which is no reason to drop its view of the cell.
                 record = slot.record
         for old in elsewhere:
             logger.warning(
@@ -469,14 +470,14 @@ class Registry:
         for old in retired:
             self._drop(old)
         for old, expecting in zip(moved, left, strict=True):
-            old.become(expecting)
+            old.set_record(expecting)
             old.begin_session(None)
         if slot is None:
             self._last_id = record.id
             slot = self._slots[record.id] = self._by_ip[ip] = Slot(record)
         elif slot.serial != record.serial:
             logger.warning("unit %d (%s): %s", slot.id, ip, record.note, extra=slot.log_fields("camera"))
-        slot.become(record)
+        slot.set_record(record)
         slot.begin_session(request.T_world_camera, request.contract_minor)
         if slot.warning:
             logger.warning("unit %d (%s): %s", slot.id, ip, slot.warning, extra=slot.log_fields("pose"))
@@ -485,48 +486,48 @@ class Registry:
     def set_pose(
         self, slot: Slot, T_world_camera: Matrix, origin: PoseOrigin, quality: PoseQuality | None = None
     ) -> None:
-        """The camera is elsewhere from now on.
+        """Set the camera's pose.
 
         Raises:
-            Refusal: 507, it cannot be stored; nothing was changed.
+            Refusal: 507, it cannot be stored; nothing is changed.
         """
-        record = slot.record.posed(T_world_camera, origin, quality=quality)
+        record = slot.record.with_pose(T_world_camera, origin, quality=quality)
         self._store.save_units([record])
-        slot.become(record)
+        slot.set_record(record)
 
     def get(self, unit_id: int) -> Slot:
-        """The slot with this id.
+        """Return the slot with this id.
 
         Raises:
-            Refusal: 404, there is none.
+            Refusal: 404, the unit is unknown.
         """
         slot = self._slots.get(unit_id)
         if slot is None:
-            raise Refusal(404, f"unit {unit_id}: not known here, initialize first")
+            raise Refusal(404, f"unit {unit_id}: not known here; initialize first")
         return slot
 
     def own(self, unit_id: int, ip: str) -> Slot:
-        """The slot with this id, which must be the caller's.
+        """Return the slot with this id, which must be the caller's.
 
         Raises:
-            Refusal: 404, there is none; 403, it is that of another IP.
+            Refusal: 404, the unit is unknown; 403, it has another IP.
         """
         slot = self.get(unit_id)
         if slot.ip != ip:
-            raise Refusal(403, f"unit {unit_id}: it is not the unit of {ip}")
+            raise Refusal(403, f"unit {unit_id}: it has another IP than {ip}")
         return slot
 
     def remove(self, unit_id: int) -> None:
-        """Forget a unit.
+        """Delete a unit.
 
         Raises:
-            Refusal: 404, there is none; 507, it cannot be stored.
+            Refusal: 404, the unit is unknown; 507, the change cannot be stored.
         """
         slot = self.get(unit_id)
         self._store.save_units([], [unit_id])
         self._drop(slot)
 
-    def ask(
+    def send_command(
         self,
         slot: Slot,
         verb: Verb,
@@ -535,18 +536,21 @@ class Registry:
         raw: bool = False,
         on_end: Callable[[Outcome], None] | None = None,
     ) -> Command:
-        """Have a unit do something; it learns of it with the answer to its next update. `on_end` is told the outcome.
+        """Send a command to a unit with the answer to its next update. `on_end` receives the outcome.
 
         Raises:
-            Refusal: 409, too many commands wait for it already.
+            Refusal: 409, too many commands wait for it already, or the unit does not understand this master.
         """
         slot.expire(now_ns)
-        if len(slot.asked) >= MAX_COMMANDS:
+        health = slot.session.health
+        if health.trouble_code == "contract":
+            raise Refusal(409, f"unit {slot.id}: it takes no commands of this master: {health.trouble}")
+        if len(slot.pending) >= MAX_COMMANDS:
             raise Refusal(409, f"unit {slot.id}: {MAX_COMMANDS} commands wait for it already")
         self._last_command += 1
         command = Command(id=self._last_command, verb=verb, image=image, raw=raw)
         expires_s = IMAGE_EXPIRES_S if verb == "image" else COMMAND_EXPIRES_S
-        slot.asked.append(_Asked(command, now_ns + round(expires_s * NS_PER_S), on_end))
+        slot.pending.append(_PendingCommand(command, now_ns + round(expires_s * NS_PER_S), on_end))
         if verb != "image":
             slot.last_command = CommandRow(id=command.id, verb=verb, outcome=None)
         return command
@@ -556,32 +560,33 @@ class Registry:
 
 
 def sentence_of(cause: Reason | None) -> str:
-    """A reason in words; empty where there is none."""
+    """Return a reason's sentence; empty without a reason."""
     return "" if cause is None else cause.sentence
 
 
 def _behind(code: ReasonCode, sentence: str, version: int, current: int) -> Reason:
-    """A unit that works with a version that is not the current one."""
+    """Return the reason for a unit that works with an old version."""
     return Reason(code, sentence, {"version": float(version), "current": float(current)})
 
 
 def _registered(request: InitializeRequest, ip: str, before: UnitRecord | int, elsewhere: Iterable[Slot]) -> UnitRecord:
-    """What is kept of a unit that registers: `before` is its record, or the id of one that is new."""
+    """Return the record of a unit that registers: `before` is its old record, or the id of a new unit."""
     if isinstance(before, int):
         record = UnitRecord(id=before, ip=ip)
         for old in elsewhere:
             if old.T_world_camera is not None and old.record.boot_id and old.record.boot_id == request.boot_id:
-                record = record.posed(old.T_world_camera, old.record.pose_origin, quality=old.record.pose_quality)
+                record = record.with_pose(old.T_world_camera, old.record.pose_origin, quality=old.record.pose_quality)
     elif before.serial != request.serial:
         note = f"the camera changed from {before.serial} to {request.serial}, so its pose is void"
-        record = before.posed(None, None, note)
+        record = before.with_pose(None, None, note)
     else:
         record = before
-    told = request.T_world_camera
-    if told is not None and (
-        record.T_world_camera is None or (record.pose_origin in TOLD_ORIGINS and record.T_world_camera != told)
+    configured = request.T_world_camera
+    if configured is not None and (
+        record.T_world_camera is None
+        or (record.pose_origin in CONFIGURED_ORIGINS and record.T_world_camera != configured)
     ):
-        record = record.posed(told, request.pose_origin)
+        record = record.with_pose(configured, request.pose_origin)
     return record.model_copy(
         update={
             "serial": request.serial,
@@ -593,10 +598,10 @@ def _registered(request: InitializeRequest, ip: str, before: UnitRecord | int, e
     )
 
 
-def _expecting(left: UnitRecord, taken: UnitRecord, ip: str) -> UnitRecord:
-    """The slot that a camera left for `ip`: the one that was there is expected here, without a pose."""
-    note = f"camera {left.serial} is at {ip} now, where camera {taken.serial} was, which did not come back yet"
-    return left.posed(None, None, note).model_copy(
+def _expected_elsewhere(left: UnitRecord, taken: UnitRecord, ip: str) -> UnitRecord:
+    """Return the slot that a camera left for `ip`: the camera that was there is expected here, without a pose."""
+    note = f"camera {left.serial} is at {ip} now, where camera {taken.serial} was; that one did not come back yet"
+    return left.with_pose(None, None, note).model_copy(
         update={
             "serial": taken.serial,
             "model": taken.model,
@@ -607,13 +612,13 @@ def _expecting(left: UnitRecord, taken: UnitRecord, ip: str) -> UnitRecord:
     )
 
 
-def _pose_warning(record: UnitRecord, told: Matrix | None) -> str:
-    """That a unit was told another pose than counts; empty when not."""
-    if told is None or record.T_world_camera is None or told == record.T_world_camera:
+def _pose_warning(record: UnitRecord, configured: Matrix | None) -> str:
+    """Return a warning if the unit's configured pose differs from the pose that counts; else an empty string."""
+    if configured is None or record.T_world_camera is None or configured == record.T_world_camera:
         return ""
-    known_pose, told_pose = np.array(record.T_world_camera), np.array(told)
-    shift_mm = 1e3 * float(np.linalg.norm(known_pose[:3, 3] - told_pose[:3, 3]))
-    turn_deg = math.degrees(angle_rad(inverse(known_pose) @ told_pose))
+    known_pose, configured_pose = np.array(record.T_world_camera), np.array(configured)
+    shift_mm = 1e3 * float(np.linalg.norm(known_pose[:3, 3] - configured_pose[:3, 3]))
+    turn_deg = math.degrees(angle_rad(inverse(known_pose) @ configured_pose))
     if record.pose_origin == "refined" and shift_mm <= REFINED_MM and turn_deg <= REFINED_DEG:
         return ""
     return (

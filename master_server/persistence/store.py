@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What must outlive the master, in one SQLite file: units with their poses, settings, versions and the cell.
+"""The state that outlives the master, in one SQLite file: units with their poses, settings, versions and the cell.
 
-Whoever changes something writes it here first and changes the memory then, so that what a caller was told is on the
-disk, and what could not be written did not happen. The write is done by the event loop itself and not by a thread:
-between check and commit no other change can come in, no rollback of memory is needed, and a change is a matter of a
-few kilobytes and one fsync, some milliseconds. An update writes nothing. Only meshes are long; `add_meshes` may be
-called by a thread before, which leaves the document to `save_cell`.
+Every change is written here first and applied in memory afterwards. So an acknowledged change is on the disk, and a
+change that could not be written did not happen. The event loop itself writes, not a thread: no other change can come
+between check and commit, and memory never has to be rolled back. A change is a few kilobytes and one fsync, which take
+some milliseconds. An update writes nothing. Only meshes are long: a thread may call `add_meshes` before, and
+`save_cell` then writes only the document.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 FILE_NAME = "master.db"
 
 APPLICATION_ID = 0x43574D53
-"""In the file's header, so that a database of something else is never taken for ours."""
+"""Stored in the file's header; distinguishes our file from another program's database."""
 
 SCHEMA_VERSION = 3
 
@@ -46,16 +46,16 @@ UPGRADES = {
     1: "ALTER TABLE units ADD COLUMN pose_quality TEXT NOT NULL DEFAULT '{}'",
     2: "ALTER TABLE units ADD COLUMN intrinsics TEXT",
 }
-"""By version: what makes a store of it one of the next version."""
+"""The statement that turns a store of the given version into one of the next version."""
 
 LOCK_TIMEOUT_S = 3.0
-"""A master that was told to stop has let go of its file by then."""
+"""A master that is shutting down has closed its file by then."""
 
 TRY_EVERY_S = 1.0
-"""Between attempts to store anything at all while the last change could not be."""
+"""Between attempts to write after a change could not be stored."""
 
 LOG_BYTES = 2**22
-"""What SQLite's log may keep of the disk once its content is in the file."""
+"""Largest size of SQLite's log once its content is in the file."""
 
 SCHEMA = f"""
 CREATE TABLE units (
@@ -80,7 +80,7 @@ PRAGMA user_version = {SCHEMA_VERSION};
 
 
 class UnitRecord(Message):
-    """What is kept of a unit; immutable, a change is a new record."""
+    """The stored state of a unit. It is immutable: a change makes a new record."""
 
     id: Counter
     ip: str
@@ -95,14 +95,14 @@ class UnitRecord(Message):
     pose_quality: PoseQuality = PoseQuality()
     intrinsics: Intrinsics | None = None
 
-    def posed(
+    def with_pose(
         self,
         T_world_camera: Matrix | None,
         origin: PoseOrigin | None,
         note: str = "",
         quality: PoseQuality | None = None,
     ) -> UnitRecord:
-        """The same unit with its camera elsewhere, or where nobody knows; `note` tells why."""
+        """Return the same unit with another pose of its camera, or without one; `note` gives the reason."""
         return self.model_copy(
             update={
                 "T_world_camera": T_world_camera,
@@ -116,15 +116,15 @@ class UnitRecord(Message):
 
 @dataclass(frozen=True)
 class Saved:
-    """All that was stored. `settings` and `configured` are as they were written, maybe by another version.
+    """All stored state. `settings` and `configured` are as they were written, possibly by another version.
 
     Attributes:
         units: by id.
-        last_id: the last one that was ever given.
-        versions: None in a store in which no master has begun yet.
+        last_id: the last id that was given to a unit.
+        versions: None in the store of a master that never started.
         settings: all of them.
         configured: those that the configuration had set when the master was last started.
-        cell: the one that was watched.
+        cell: the watched cell.
         cell_file: hash of the cell that was last loaded from a file.
     """
 
@@ -138,7 +138,7 @@ class Saved:
 
 
 class Store:
-    """One connection to the file, held by one master alone; each change is one transaction."""
+    """A connection to the file, which one master holds exclusively; each change is one transaction."""
 
     def __init__(self, connection: sqlite3.Connection, name: str) -> None:
         """Use `Store.open` or `Store.in_memory`."""
@@ -147,32 +147,32 @@ class Store:
         self._lock = threading.Lock()
         self._named: frozenset[str] = frozenset()
         self.trouble: str | None = None
-        """Why the last change could not be stored, in one sentence; None since one could again."""
+        """The reason why the last change could not be stored, in one sentence; None once writing succeeds again."""
 
     @classmethod
     def in_memory(cls) -> Store:
-        """A store that forgets everything with its process."""
+        """Return a store in memory, which ends with its process."""
         connection = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
         connection.executescript(SCHEMA)
         store = cls(connection, ":memory:")
-        # Nobody closes what has no file to let go of, and Python (3.13) warns of a connection that is left open.
+        # A store without a file is never closed, and Python (3.13) warns of a connection that is left open.
         weakref.finalize(store, connection.close)
         return store
 
     @classmethod
     def open(cls, path: Path) -> Store:
-        """The store in this file; made if there is none.
+        """Open the store in this file; make one if there is none.
 
         Raises:
-            ConfigError: it cannot be read or written, is damaged, is no store of a master, is one of a newer
-                version, or another master holds it. It is left as it is.
+            ConfigError: the file cannot be read or written, is damaged, is not a master's store or is one of a newer
+                version, or another master holds it. The file stays as it is.
         """
         try:
             if not path.exists():
                 _make(path)
             connection = sqlite3.connect(path, timeout=LOCK_TIMEOUT_S, isolation_level=None, check_same_thread=False)
         except (sqlite3.Error, OSError) as error:
-            raise ConfigError(f"{path}: cannot open what the master keeps: {error}") from error
+            raise ConfigError(f"{path}: cannot open the master's store: {error}") from error
         try:
             _check(connection, path)
         except BaseException as error:
@@ -180,22 +180,22 @@ class Store:
             if isinstance(error, sqlite3.OperationalError) and "locked" in str(error):
                 raise ConfigError(f"{path}: another master is running on it; stop that, or use --state-dir") from error
             if isinstance(error, sqlite3.OperationalError):
-                raise ConfigError(f"{path}: cannot read and write what the master keeps: {error}") from error
+                raise ConfigError(f"{path}: cannot read and write the master's store: {error}") from error
             if isinstance(error, sqlite3.Error):
                 raise _damaged(path, str(error)) from error
             raise
         return cls(connection, str(path))
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         with self._lock:
             self._connection.close()
 
     def load(self) -> Saved:
-        """All that was stored.
+        """Load all stored state.
 
         Raises:
-            ConfigError: it is damaged.
+            ConfigError: the file is damaged.
         """
         try:
             with self._lock:
@@ -226,7 +226,7 @@ class Store:
     def begin(
         self, cell: Cell, cell_file: str, settings: Settings, configured: Mapping[str, Any], versions: Versions
     ) -> None:
-        """What a master begins with: the cell that it watches, the hash of that in the file, and its settings."""
+        """Store the state at start: the watched cell, the hash of the cell in the file, and the settings."""
         document, meshes = cell.to_document()
         with self._transaction() as connection:
             _put(connection, "configured", configured)
@@ -237,7 +237,7 @@ class Store:
         self._named = frozenset(meshes)
 
     def save_units(self, changed: Iterable[UnitRecord], gone: Iterable[int] = ()) -> None:
-        """Units that are new or changed, and ids of those that are no more, in one transaction."""
+        """Store new or changed units and delete those with the ids `gone`, in one transaction."""
         names = tuple(UnitRecord.model_fields)
         updates = ", ".join(f"{name} = excluded.{name}" for name in names[1:])
         statement = (
@@ -259,15 +259,15 @@ class Store:
                 )
 
     def save_settings(self, settings: Settings, versions: Versions) -> None:
-        """Changed settings, and the versions that come with them."""
+        """Store changed settings and the versions that belong to them."""
         with self._transaction() as connection:
             _put(connection, "settings", settings.model_dump(mode="json"))
             _put(connection, "versions", versions.model_dump())
 
     def add_meshes(self, meshes: Mapping[str, bytes]) -> None:
-        """Meshes by their sha256, ahead of the cell that names them; may be called by a thread.
+        """Store meshes by their sha256 before the cell that names them; a thread may call it.
 
-        Those that were ahead before, of a cell that was refused, make room.
+        Earlier ones that no stored cell names, as those of a refused cell, are deleted.
         """
         with self._transaction() as connection:
             _drop_meshes(connection, self._named | set(meshes))
@@ -276,7 +276,7 @@ class Store:
                 connection.execute("INSERT OR IGNORE INTO meshes VALUES (?, ?)", mesh)
 
     def save_cell(self, document: Mapping[str, Any], meshes: Mapping[str, bytes], versions: Versions) -> None:
-        """A cell as of `Cell.to_document`, and the versions that come with it; meshes of the one before are dropped."""
+        """Store a cell as of `Cell.to_document` with its versions; drop the meshes of the previous cell."""
         with self._transaction() as connection:
             _put_cell(connection, document, meshes)
             _put(connection, "versions", versions.model_dump())
@@ -285,7 +285,7 @@ class Store:
     # ------------------------------------------------------------------ while nothing can be stored
 
     async def follow(self) -> None:
-        """After a change that could not be stored try whether one can again, until cancelled."""
+        """After a change could not be stored, try to write until that succeeds again; runs until cancelled."""
         while True:
             await asyncio.sleep(TRY_EVERY_S)
             if self.trouble is not None:
@@ -293,9 +293,9 @@ class Store:
                     await asyncio.to_thread(self.attempt)
 
     def attempt(self) -> None:
-        """Write something that leaves nothing; that it can be written ends `trouble`. Raises as a change does."""
+        """Write and delete a test row; success clears `trouble`. Raises as a change does."""
         with self._transaction() as connection:
-            # What is as it was would not be written at all.
+            # SQLite does not write a value that equals the old one.
             _put(connection, "attempt", 0)
             connection.execute("DELETE FROM facts WHERE name = 'attempt'")
 
@@ -314,7 +314,7 @@ class Store:
                 raise Refusal(507, f"nothing was changed: the master cannot store it ({error})") from error
             finally:
                 if self._connection.in_transaction:
-                    # SQLite has undone by itself what it could not write.
+                    # SQLite has rolled back the failed write itself.
                     with contextlib.suppress(sqlite3.Error):
                         self._connection.execute("ROLLBACK")
             if self.trouble is not None:
@@ -323,12 +323,12 @@ class Store:
 
 
 def _make(path: Path) -> None:
-    """Make an empty store, whole or not at all: a file under this name always is one."""
+    """Make an empty store, whole or not at all: a file of this name is always a complete store."""
     left_over = path.with_name(path.name + "-wal")
     if left_over.exists():
         raise ConfigError(
             f"{path}: expected the file that {left_over.name} belongs to, got none; "
-            f"put it back, or delete {left_over.name} too to begin anew"
+            f"put it back, or delete {left_over.name} too to start anew"
         )
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     partial = path.with_suffix(".partial")
@@ -347,7 +347,7 @@ def _make(path: Path) -> None:
 
 
 def _check(connection: sqlite3.Connection, path: Path) -> None:
-    # Alone with the file, it needs no memory that processes share, and a second master cannot come in.
+    # An exclusive lock needs no shared memory, and a second master cannot open the file.
     connection.execute("PRAGMA locking_mode = EXCLUSIVE")
     connection.execute("PRAGMA synchronous = FULL")
     if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
@@ -360,7 +360,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> None:
             f"{path}: expected a store of version {SCHEMA_VERSION}, got version {version}: it was written by a newer "
             "master-server; install that again, put back the copy of before the update, or use another --state-dir"
         )
-    # A page that was cut short is filled up in silence; while there is a log it has the page as a whole.
+    # SQLite fills up a truncated page without an error; while there is a log, it holds the whole page.
     log = path.with_name(path.name + "-wal")
     page_bytes = connection.execute("PRAGMA page_size").fetchone()[0]
     if (not log.exists() or log.stat().st_size == 0) and path.stat().st_size % page_bytes:
@@ -369,7 +369,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> None:
         raise _damaged(path, found)
     connection.execute("PRAGMA journal_mode = WAL")
     connection.execute(f"PRAGMA journal_size_limit = {LOG_BYTES}")
-    # Takes the lock, which a read alone would not keep others from.
+    # Take the write lock: a read alone would not lock out other processes.
     connection.execute("BEGIN IMMEDIATE")
     if version < SCHEMA_VERSION:
         for older in range(version, SCHEMA_VERSION):
@@ -380,9 +380,9 @@ def _check(connection: sqlite3.Connection, path: Path) -> None:
 
 def _damaged(path: Path | str, what: str) -> ConfigError:
     return ConfigError(
-        f"{path}: expected what a master keeps between its runs, got something else or a damaged file ({what}); "
-        "put back a copy, or move it and what begins with its name away to begin anew: units, poses and settings "
-        "are then to be set again"
+        f"{path}: expected a master's store, got something else or a damaged file ({what}); "
+        "put back a copy, or move away all files whose names begin with its name to start anew: units, poses and "
+        "settings must then be set again"
     )
 
 
@@ -405,7 +405,7 @@ def _put_cell(connection: sqlite3.Connection, document: Mapping[str, Any], meshe
 
 
 def _drop_meshes(connection: sqlite3.Connection, named: Collection[str]) -> set[str]:
-    """Drop all meshes but the `named` ones; returns those that are there."""
+    """Drop all meshes but the `named` ones; return those that are stored."""
     stored = {sha256 for (sha256,) in connection.execute("SELECT sha256 FROM meshes")}
     old = stored.difference(named)
     connection.executemany("DELETE FROM meshes WHERE sha256 = ?", [(sha256,) for sha256 in old])

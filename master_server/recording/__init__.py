@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the master saw, written to files and played back.
+"""The state of the master over time: written to files and played back.
 
-Who plays a recording needs none of what writes one, so this page re-exports nothing. In the order of the flow:
+A replay does not need the modules that write, so this page re-exports nothing. In the order of the flow:
 
-    moment            a moment to be recorded, and what a recording holds of it
-    foxglove          such a moment in the schemas that Foxglove shows
+    moment            one recorded moment, and its form in a recording
+    foxglove          a moment in the schemas that Foxglove displays
     recording_file    one file of a recording
     recorder          files one after another, in a thread that nothing waits for
-    recording_reader  a recording opened for reading
+    recording_reader  opens a recording for reading
     timeline          the files of one recording as one
-    replay            a recording that answers as the master did
+    replay            answers from a recording as the master did
 """

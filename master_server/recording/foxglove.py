@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A moment in the schemas that Foxglove shows as they are; all in the frame `world`, metres, colours 0 to 1."""
+"""Convert a moment to Foxglove's own schemas; all in the frame `world`, in metres, colours 0 to 1."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ from shared.transforms import Transform
 WORLD = "world"
 
 POINT = np.dtype({"names": ["x", "y", "z", "witnesses"], "formats": ["<f4", "<f4", "<f4", "u1"], "itemsize": 16})
-"""Of one voxel's centre; padded, so that every point is aligned."""
+"""Bytes of one voxel's centre; padded, so that every point is aligned."""
 
 FIELD_TYPES = {"<f4": PackedElementField.FLOAT32, "|u1": PackedElementField.UINT8}
 
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 
 MAX_UNSEEN_BOXES = 2048
-"""Beyond these nobody can tell one from another, and building them would take longer than their turn."""
+"""With more boxes, nobody can distinguish them, and building them would take longer than the recording period."""
 
 CAD_COLOR = Color(r=0.6, g=0.62, b=0.65, a=1.0)
 ROBOT_COLOR = Color(r=0.25, g=0.45, b=0.8, a=0.6)
@@ -52,18 +52,18 @@ UNSEEN_COLOR = Color(r=0.85, g=0.6, b=0.1, a=0.08)
 BOX_LINE_PX = 1.5
 
 LENGTH_DELIMITED = 2
-"""Protobuf's wire type of a message in a message."""
+"""Protobuf's wire type of a nested message."""
 
 
 def stamp_of(log_ns: int) -> Timestamp:
-    """Nanoseconds since 1970 as Foxglove has them."""
+    """Convert nanoseconds since 1970 to Foxglove's time."""
     stamp = Timestamp()
     stamp.FromNanoseconds(log_ns)
     return stamp
 
 
 def point_cloud(view: MapView, stamp: Timestamp) -> PointCloud:
-    """The voxels' centres, each with the number of units that report it."""
+    """Return the voxels' centres, each with the number of units that report it."""
     centres = view.lattice.centres(view.lattice.indices(view.keys))
     points = np.zeros(len(centres), POINT)
     points["x"], points["y"], points["z"] = centres.T
@@ -83,7 +83,7 @@ def point_cloud(view: MapView, stamp: Timestamp) -> PointCloud:
 
 
 def transforms(moment: Moment, stamp: Timestamp) -> FrameTransforms:
-    """Where cameras (`unit_3`), objects (`object/pallet`) and links (`robot/forearm`) are, as far as it is known."""
+    """Return the known poses of cameras (`unit_3`), objects (`object/pallet`) and links (`robot/forearm`)."""
     found = [
         _transform(f"unit_{row.id}", np.array(row.T_world_camera), stamp)
         for row in moment.units
@@ -98,9 +98,9 @@ def transforms(moment: Moment, stamp: Timestamp) -> FrameTransforms:
 
 
 def cell_scene(cell: Cell, stamp: Timestamp) -> SceneUpdate:
-    """The cell's box as lines, its CAD and the robot's links as models; replaces whatever cell there was.
+    """Return the cell's box as lines, and its CAD and the robot's links as models; replaces an earlier cell.
 
-    Where objects and links are, `transforms` tells, so that a pallet on its way is not drawn again and again.
+    The poses of objects and links come from `transforms`, so that a moving pallet is not drawn again and again.
     """
     entities = [SceneEntity(timestamp=stamp, frame_id=WORLD, id="box", lines=[_box_lines(cell)])]
     entities += [
@@ -120,7 +120,7 @@ def cell_scene(cell: Cell, stamp: Timestamp) -> SceneUpdate:
 
 
 def unseen_scene(blocks: Lattice, seen_by: NDArray[np.uint8], stamp: Timestamp) -> SceneUpdate:
-    """What no live unit looks through, as translucent boxes; blocks side by side are one. At most MAX_UNSEEN_BOXES."""
+    """Return the unseen blocks as translucent boxes; adjacent blocks are joined. At most MAX_UNSEEN_BOXES."""
     first, last = boxes_of(seen_by == 0)
     sizes = last - first
     if len(first) > MAX_UNSEEN_BOXES:
@@ -134,9 +134,9 @@ def unseen_scene(blocks: Lattice, seen_by: NDArray[np.uint8], stamp: Timestamp) 
 
 
 def boxes_of(chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Boxes that together cover exactly the chosen blocks: first (N, 3), and one beyond the last (N, 3).
+    """Return boxes that together cover exactly the chosen blocks: first (N, 3), and one beyond the last (N, 3).
 
-    Runs along z, joined along y where they are equal, and along x.
+    Runs along z are joined along y where they are equal, then along x.
     """
     padded = np.pad(chosen, ((0, 0), (0, 0), (1, 1))).astype(np.int8)
     steps = np.diff(padded, axis=2)
@@ -149,7 +149,7 @@ def boxes_of(chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.i
 
 
 def stl_of(mesh: TriangleMesh) -> bytes:
-    """A mesh as binary STL, in metres."""
+    """Return a mesh as binary STL, in metres."""
     corners = mesh.vertices[mesh.faces].astype(np.float32)
     triangles = np.zeros(len(corners), STL_TRIANGLE)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -160,9 +160,9 @@ def stl_of(mesh: TriangleMesh) -> bytes:
 
 
 def _cubes(middles_m: NDArray[np.float64], edges_m: NDArray[np.float64]) -> bytes:
-    """The field `cubes` of a SceneEntity in protobuf's encoding, upright boxes with middles and edges (N, 3).
+    """Return the field `cubes` of a SceneEntity in protobuf's encoding, upright boxes with middles and edges (N, 3).
 
-    One is encoded by the library, and its six numbers replaced in all: thousands of objects would hold the
+    The library encodes one box, and its six numbers are replaced for all others. Thousands of objects would hold the
     interpreter for 30 ms, and every update of a unit would wait.
     """
     marks = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0)
@@ -180,7 +180,7 @@ def _cubes(middles_m: NDArray[np.float64], edges_m: NDArray[np.float64]) -> byte
 def _joined(
     first: NDArray[np.int64], last: NDArray[np.int64], axis: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Boxes that touch along `axis` and are alike along the others, as one."""
+    """Join boxes that touch along `axis` and are equal along the other axes."""
     others = [other for other in range(3) if other != axis]
     order = np.lexsort((first[:, axis], *(last[:, other] for other in others), *(first[:, other] for other in others)))
     first, last = first[order], last[order]

@@ -14,21 +14,32 @@ Cells and meshes are attachments, named by their sha256. Log times are nanosecon
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from master_server.core import MapView, Master
 from shared.cell import Cell
 from shared.errors import InputError
 from shared.lattice import Lattice
-from shared.messages import CellReference, Counter, LatticeDescription, Nanoseconds, Reason, RobotAnswer, UnitRow
+from shared.messages import (
+    OPEN,
+    CellReference,
+    Counter,
+    LatticeDescription,
+    Nanoseconds,
+    Reason,
+    RobotAnswer,
+    RobotState,
+    UnitRow,
+)
 from shared.settings import Settings
 
-FORMAT = 1
-"""Rises when older recordings can no longer be served."""
+FORMAT_MAJOR, FORMAT_MINOR = 1, 1
+"""Version of a recording. The major rises when older recordings can no longer be played; the minor when a status gets
+new names or codes, which an older reader ignores. Recordings of 1.0 say `1`."""
 
 METADATA = "cellwatch"
 """Name of the metadata record that tells the format."""
@@ -79,9 +90,26 @@ def moment_of(master: Master, now_ns: int) -> Moment:
 
 
 class Record(BaseModel):
-    """One message of a recording. Frozen; unknown names are refused."""
+    """One message of a recording. Frozen; names of a later minor are ignored."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_bytes="base64", val_json_bytes="base64")
+    model_config = ConfigDict(frozen=True, extra="ignore", ser_json_bytes="base64", val_json_bytes="base64")
+
+
+class RecordedRobot(RobotAnswer):
+    """The robot's state in a recording: unknown names are ignored, an unknown state kept."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    state: Annotated[RobotState, OPEN]
+
+
+def _recorded_robot(robot: object) -> object:
+    if not isinstance(robot, dict):
+        return robot
+    try:
+        return RobotAnswer.model_validate(robot)
+    except ValidationError:
+        return RecordedRobot.model_validate(robot)
 
 
 class StateRecord(Record):
@@ -97,7 +125,7 @@ class StateRecord(Record):
     units_live: int
     voxels: int
     units: tuple[UnitRow, ...]
-    robot: RobotAnswer
+    robot: Annotated[RobotAnswer, BeforeValidator(_recorded_robot)]
     cell: CellReference
     causes: tuple[Reason, ...] = ()
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the master sees is written to files, bounded in size, in a thread that nothing waits for."""
+"""Record the master's state to files of bounded size, in a thread that nothing waits for."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from shared.errors import Refusal
 logger = logging.getLogger(__name__)
 
 WAITING_MAX = 4
-"""Moments that wait for a slow disk, each a whole map; a newer one takes the place of the oldest."""
+"""Queue of moments for a slow disk, each a whole map; a newer one replaces the oldest."""
 
 PATTERN = "cellwatch-*.mcap"
-"""Only files of this name are ever deleted."""
+"""Names of recordings; only such files are ever deleted."""
 
 
 class RecordingConfig(BaseModel):
-    """What is recorded, where, and how much of it is kept."""
+    """Recording: on or off, folder, rate, and bounds of the files."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    enabled: bool = Field(default=False, description="Whether the master records from its start.")
-    folder: Path | None = Field(default=None, description="Where; by default `recordings` below `state_dir`.")
-    maps_per_s: float = Field(default=10.0, ge=0.1, le=30.0, description="How often the master is looked at.")
-    file_bytes_max: int = Field(default=2**28, ge=2**16, le=2**36, description="A file that is larger is followed.")
-    file_s_max: float = Field(default=600.0, ge=1.0, le=86400.0, description="A file that is longer is followed.")
-    total_bytes_max: int = Field(default=2**33, ge=2**17, description="Of all recordings; the oldest are deleted.")
-    free_bytes_min: int = Field(default=2**30, ge=0, description="With less left on the disk recording stops.")
+    enabled: bool = Field(default=False, description="If true, the master records from its start.")
+    folder: Path | None = Field(default=None, description="Folder; by default `recordings` below `state_dir`.")
+    maps_per_s: float = Field(default=10.0, ge=0.1, le=30.0, description="Recorded moments per second.")
+    file_bytes_max: int = Field(default=2**28, ge=2**16, le=2**36, description="Beyond this size a new file starts.")
+    file_s_max: float = Field(default=600.0, ge=1.0, le=86400.0, description="Beyond this duration a new file starts.")
+    total_bytes_max: int = Field(default=2**33, ge=2**17, description="Size of all recordings; the oldest are deleted.")
+    free_bytes_min: int = Field(default=2**30, ge=0, description="Recording stops if the disk has less free space.")
 
     @model_validator(mode="after")
     def _room_for_two(self) -> RecordingConfig:
@@ -51,26 +51,26 @@ class RecordingConfig(BaseModel):
 
 
 class RecordingStatus(BaseModel):
-    """`GET /recording`: whether the master records, and what became of what it recorded."""
+    """`GET /recording`: the state of the recording, and its counts."""
 
     recording: bool
     folder: str
     file: str | None = Field(default=None, description="The newest file.")
-    bytes: int = Field(default=0, description="In that file.")
-    since_ns: int | None = Field(default=None, description="When recording began, by the master's clock.")
-    moments: int = Field(default=0, description="Written since then.")
-    maps: int = Field(default=0, description="Of these, with a map that had changed.")
-    dropped: int = Field(default=0, description="Moments left out because the disk was too slow.")
-    reason: str = Field(default="", description="Why recording stopped by itself.")
+    bytes: int = Field(default=0, description="Size of that file.")
+    since_ns: int | None = Field(default=None, description="Time when recording started, by the master's clock.")
+    moments: int = Field(default=0, description="Moments written since then.")
+    maps: int = Field(default=0, description="Moments with a map that had changed.")
+    dropped: int = Field(default=0, description="Moments dropped because the disk was too slow.")
+    reason: str = Field(default="", description="The reason if recording stopped by itself.")
 
 
 class _Stopped(Exception):
-    """Recording cannot go on; the text says why."""
+    """Recording cannot go on; the text gives the reason."""
 
 
 @dataclass
 class _Run:
-    """One recording from start to stop. The thread alone writes what `GET /recording` reads, but for `dropped`."""
+    """One recording from start to stop. Only the thread writes the fields of `GET /recording`, except `dropped`."""
 
     began_ns: int
     waiting: SimpleQueue[Moment | None] = field(default_factory=SimpleQueue)
@@ -82,7 +82,7 @@ class _Run:
     reason: str = ""
 
     def offer(self, moment: Moment) -> None:
-        """Hand a moment to the thread, in place of the oldest that waits if too many do; never blocks."""
+        """Queue a moment for the thread; drop the oldest if the queue is full; never blocks."""
         if self.waiting.qsize() >= WAITING_MAX:
             with contextlib.suppress(Empty):
                 self.waiting.get_nowait()
@@ -91,7 +91,7 @@ class _Run:
 
 
 class Recorder:
-    """Looks at the master at a rate, and has what it sees written. Its own failures end the recording, nothing else."""
+    """Sample the master at a rate and record it. A failure here ends the recording only."""
 
     def __init__(self, master: Master, config: RecordingConfig, folder: Path) -> None:
         self._master = master
@@ -99,21 +99,21 @@ class Recorder:
         self._folder = config.folder or folder
         self._run: _Run | None = None
         self._thread: Thread | None = None
-        self._looking: asyncio.Task[None] | None = None
+        self._sampling: asyncio.Task[None] | None = None
         self._changing = asyncio.Lock()
 
     @property
     def enabled(self) -> bool:
-        """Whether it is to begin with the master."""
+        """True if recording starts with the master."""
         return self._config.enabled
 
     def status(self) -> RecordingStatus:
-        """How it stands."""
+        """Return the state of the recording."""
         run = self._run
         if run is None:
             return RecordingStatus(recording=False, folder=str(self._folder))
         return RecordingStatus(
-            recording=self._looking is not None and not run.reason,
+            recording=self._sampling is not None and not run.reason,
             folder=str(self._folder),
             file=None if run.path is None else str(run.path),
             bytes=run.bytes,
@@ -125,7 +125,7 @@ class Recorder:
         )
 
     async def start(self) -> RecordingStatus:
-        """Begin a new file; harmless while it records.
+        """Start a new file; does nothing if it records already.
 
         Raises:
             Refusal: 507, the disk is full, or the folder cannot be written.
@@ -143,43 +143,43 @@ class Recorder:
             run.offer(moment_of(self._master, monotonic_ns()))
             self._thread = Thread(target=_write, args=(folder, run), name="recording")
             self._thread.start()
-            self._looking = asyncio.create_task(self._look(run), name="recording")
+            self._sampling = asyncio.create_task(self._sample(run), name="recording")
             return self.status()
 
     async def begin(self) -> None:
-        """As `start`, but a master starts even if it cannot record: `status` says why not."""
+        """As `start`, but the master starts even if it cannot record: `status` has the reason."""
         try:
             await self.start()
         except Refusal as refusal:
             logger.error("%s", refusal)
 
     async def stop(self) -> RecordingStatus:
-        """Finish the file; harmless when it does not record."""
+        """Finish the file; does nothing if it does not record."""
         async with self._changing:
             await self._end()
             return self.status()
 
     async def _end(self) -> None:
-        looking, thread, run = self._looking, self._thread, self._run
-        self._looking = self._thread = None
-        if looking is None or thread is None or run is None:
+        sampling, thread, run = self._sampling, self._thread, self._run
+        self._sampling = self._thread = None
+        if sampling is None or thread is None or run is None:
             return
-        looking.cancel()
+        sampling.cancel()
         run.waiting.put(None)
         await asyncio.to_thread(thread.join)
 
-    async def _look(self, run: _Run) -> None:
+    async def _sample(self, run: _Run) -> None:
         period_ns = round(NS_PER_S / self._config.maps_per_s)
         due_ns = monotonic_ns()
         while not run.reason:
-            # After a stall it goes on from now, and makes up for nothing.
+            # After a stall, sampling continues from now; missed moments are left out.
             due_ns = max(due_ns + period_ns, monotonic_ns())
             await asyncio.sleep((due_ns - monotonic_ns()) / NS_PER_S)
             run.offer(moment_of(self._master, monotonic_ns()))
 
 
 class _Folder:
-    """The files of one recording: one after another, the oldest deleted."""
+    """The files of one recording: one after another; the oldest are deleted."""
 
     def __init__(self, folder: Path, config: RecordingConfig, run: _Run) -> None:
         self._folder = folder
@@ -196,11 +196,11 @@ class _Folder:
         """Write a moment; raises _Stopped."""
         try:
             if self._is_done:
-                # Only now, so that no file is begun that nothing comes to stand in.
+                # Open the file only now, so that it never stays empty.
                 self._finish()
                 self._file = self._next()
             finished_chunk = self._file.add(moment)
-            self._tell()
+            self._update_counts()
             self._run.moments += 1
             if not finished_chunk:
                 return
@@ -238,17 +238,17 @@ class _Folder:
         self._file.close()
         self._run.bytes = self._file.path.stat().st_size
 
-    def _tell(self) -> None:
+    def _update_counts(self) -> None:
         self._run.bytes = self._file.bytes_written
         self._run.maps = self._maps_before + self._file.maps
 
     def _full(self) -> str:
-        """Why nothing more should be written to this disk; empty when there is room."""
+        """Return the reason why the disk must not be filled further; empty if there is room."""
         free, least = shutil.disk_usage(self._folder).free, self._config.free_bytes_min
         return "" if free >= least else f"{self._folder}: {free} bytes are left on the disk, at least {least} must stay"
 
     def _make_room(self) -> None:
-        """Delete the oldest until the next file fits into the bound."""
+        """Delete the oldest files until the next one fits into the bound."""
         files = sorted(self._folder.glob(PATTERN), key=lambda path: path.stat().st_mtime_ns)
         sizes = [path.stat().st_size for path in files]
         kept = sum(sizes)
@@ -261,7 +261,7 @@ class _Folder:
 
 
 def _write(folder: _Folder, run: _Run) -> None:
-    """The thread: write what is offered until there is nothing more to come."""
+    """Run the thread: write queued moments until the recording ends."""
     try:
         while (moment := run.waiting.get()) is not None:
             folder.add(moment)
@@ -270,7 +270,7 @@ def _write(folder: _Folder, run: _Run) -> None:
         run.reason = str(stopped)
         logger.error("recording has stopped: %s", run.reason)
     except Exception as error:
-        # A bug here is no reason for the master to go without its map; it is told as one.
+        # A bug here must not stop the master, so it is logged with its traceback.
         run.reason = f"{type(error).__name__}: {error}"
         logger.exception("recording has stopped")
 

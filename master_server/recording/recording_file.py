@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One file of a recording, written so that a killed master loses one chunk at most."""
+"""One file of a recording. If the master is killed, at most one chunk is lost."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from pydantic import BaseModel
 
 from master_server.recording import foxglove
 from master_server.recording.moment import (
-    FORMAT,
+    FORMAT_MAJOR,
+    FORMAT_MINOR,
     MAP_TOPIC,
     METADATA,
     SEEN_TOPIC,
@@ -39,16 +40,16 @@ from shared.clock import NS_PER_S
 from shared.settings import Settings
 
 CHUNK_S = 1.0
-"""A chunk is written whole and handed to the operating system; what a kill loses, and the step in which one seeks."""
+"""Duration of a chunk, which is written as a whole. A kill loses one; a seek moves by one."""
 
 CHUNK_BYTES = 2**22
-"""A chunk that grows faster is written earlier; bounds the memory of who writes and of who reads."""
+"""A chunk that grows faster is written earlier; bounds the memory of writer and reader."""
 
 UNSEEN_PERIOD_NS = NS_PER_S
-"""Of the unseen blocks as boxes for people, who follow nothing faster; without loss they are in SEEN_TOPIC."""
+"""Period of the unseen blocks drawn as boxes for people, who need no faster; SEEN_TOPIC has them without loss."""
 
 NEVER_BYTES = 2**62
-"""The library would begin a chunk in the middle of a moment; chunks begin where this module says."""
+"""Too large to be reached: the library would start a chunk within a moment, so this module starts all chunks."""
 
 RECORDS: dict[str, type[BaseModel]] = {
     STATE_TOPIC: StateRecord,
@@ -69,10 +70,10 @@ PICTURES: dict[str, type[Message]] = {
 
 
 class RecordingFile:
-    """Moments in, an MCAP file out; every method may raise OSError."""
+    """Write moments to an MCAP file; every method may raise OSError."""
 
     def __init__(self, path: Path, wall_less_monotonic_ns: int) -> None:
-        """Begin a file that is not there yet. Log times are the master's clock plus `wall_less_monotonic_ns`."""
+        """Make a new file. Log times are the master's clock plus `wall_less_monotonic_ns`."""
         self.path = path
         self.maps = 0
         self._offset_ns = wall_less_monotonic_ns
@@ -80,9 +81,9 @@ class RecordingFile:
         try:
             self._writer = Writer(self._file, chunk_size=NEVER_BYTES)
             self._writer.start()
-            self._writer.add_metadata(METADATA, {"format": str(FORMAT)})
+            self._writer.add_metadata(METADATA, {"format": f"{FORMAT_MAJOR}.{FORMAT_MINOR}"})
             self._channels = {topic: self._json_channel(topic, model) for topic, model in RECORDS.items()}
-            self._channels |= {topic: self._picture_channel(topic, kind) for topic, kind in PICTURES.items()}
+            self._channels |= {topic: self._foxglove_channel(topic, kind) for topic, kind in PICTURES.items()}
             self._file.flush()
         except OSError:
             self._file.close()
@@ -95,13 +96,13 @@ class RecordingFile:
 
     @property
     def bytes_written(self) -> int:
-        """In the file, without the chunk that is under way."""
+        """Size of the file, without the current chunk."""
         return self._file.tell()
 
     def add(self, moment: Moment) -> bool:
-        """Write what is new in a moment; whether a chunk was finished with it."""
+        """Write all changes of a moment; return True if that finished a chunk."""
         log_ns = moment.at_ns + self._offset_ns
-        # Each chunk can be understood by itself, by who seeks and by who has no more than a part of the file.
+        # Repeat the state in each chunk, so that a reader that seeks, or has only part of the file, can use it.
         before = None if self._chunk_began_ns is None else self._before
         if self._chunk_began_ns is None:
             self._chunk_began_ns = moment.at_ns
@@ -111,8 +112,8 @@ class RecordingFile:
             self._record(MAP_TOPIC, MapRecord.of(moment.view), log_ns)
         if before is None or not _same_seen(moment, before):
             self._record(SEEN_TOPIC, SeenRecord.of(moment), log_ns)
-        self._draw(moment, log_ns)
-        # Last, so that who finds it finds all that belongs to it.
+        self._write_schemas(moment, log_ns)
+        # Last, so that a reader that finds it finds everything that belongs to it.
         self._record(STATE_TOPIC, StateRecord.of(moment), log_ns)
         self._before = moment
         full = moment.at_ns - self._chunk_began_ns >= CHUNK_S * NS_PER_S or self._chunk_bytes >= CHUNK_BYTES
@@ -121,37 +122,37 @@ class RecordingFile:
         return full
 
     def flush(self) -> None:
-        """Finish the chunk that is under way."""
+        """Finish the current chunk."""
         self._writer.flush()
         self._chunk_began_ns, self._chunk_bytes = None, 0
 
     def close(self) -> None:
-        """Finish the file with its index; closed in any case."""
+        """Finish the file with its index; the file is closed even after an error."""
         try:
             self._writer.finish()
         finally:
             self._file.close()
 
     def abandon(self) -> None:
-        """Close the file as it is, without an index; what does not fit any more is lost."""
+        """Close the file without an index; data that no longer fits is lost."""
         with contextlib.suppress(OSError):
             self._file.close()
 
-    def _draw(self, moment: Moment, log_ns: int) -> None:
-        """What is new, for people."""
+    def _write_schemas(self, moment: Moment, log_ns: int) -> None:
+        """Write the changes in the schemas for people."""
         before = self._before
         stamp = foxglove.stamp_of(log_ns)
         if before is None or moment.reference != before.reference:
             self._attach(moment, log_ns)
         if before is None or _drawn_parts(moment.cell) != _drawn_parts(before.cell):
-            self._picture(CELL_TOPIC, foxglove.cell_scene(moment.cell, stamp), log_ns)
+            self._write_foxglove(CELL_TOPIC, foxglove.cell_scene(moment.cell, stamp), log_ns)
         if before is None or not _same_map(moment, before):
-            self._picture(VOXELS_TOPIC, foxglove.point_cloud(moment.view, stamp), log_ns)
+            self._write_foxglove(VOXELS_TOPIC, foxglove.point_cloud(moment.view, stamp), log_ns)
             self.maps += 1
-        self._picture(TRANSFORMS_TOPIC, foxglove.transforms(moment, stamp), log_ns)
-        self._draw_unseen(moment, stamp, log_ns)
+        self._write_foxglove(TRANSFORMS_TOPIC, foxglove.transforms(moment, stamp), log_ns)
+        self._write_unseen(moment, stamp, log_ns)
 
-    def _draw_unseen(self, moment: Moment, stamp: Timestamp, log_ns: int) -> None:
+    def _write_unseen(self, moment: Moment, stamp: Timestamp, log_ns: int) -> None:
         unseen = (moment.blocks, moment.seen_by == 0)
         if self._drawn is not None:
             at_ns, (blocks, drawn) = self._drawn
@@ -159,10 +160,10 @@ class RecordingFile:
             if same or moment.at_ns - at_ns < UNSEEN_PERIOD_NS:
                 return
         self._drawn = moment.at_ns, unseen
-        self._picture(UNSEEN_TOPIC, foxglove.unseen_scene(moment.blocks, moment.seen_by, stamp), log_ns)
+        self._write_foxglove(UNSEEN_TOPIC, foxglove.unseen_scene(moment.blocks, moment.seen_by, stamp), log_ns)
 
     def _attach(self, moment: Moment, log_ns: int) -> None:
-        """The cell and its meshes, each once a file."""
+        """Write the cell and its meshes, each once in a file."""
         for sha256, mesh in moment.cell.meshes.items():
             if sha256 not in self._attached:
                 name = mesh_attachment(sha256)
@@ -178,13 +179,13 @@ class RecordingFile:
         schema_id = self._writer.register_schema(f"cellwatch.{model.__name__}", SchemaEncoding.JSONSchema, schema)
         return self._writer.register_channel(topic, MessageEncoding.JSON, schema_id)
 
-    def _picture_channel(self, topic: str, kind: type[Message]) -> int:
+    def _foxglove_channel(self, topic: str, kind: type[Message]) -> int:
         return self._writer.register_channel(topic, MessageEncoding.Protobuf, register_schema(self._writer, kind))
 
     def _record(self, topic: str, record: BaseModel, log_ns: int) -> None:
         self._message(topic, record.model_dump_json().encode(), log_ns)
 
-    def _picture(self, topic: str, message: Message, log_ns: int) -> None:
+    def _write_foxglove(self, topic: str, message: Message, log_ns: int) -> None:
         self._message(topic, message.SerializeToString(), log_ns)
 
     def _message(self, topic: str, data: bytes, log_ns: int) -> None:
@@ -207,6 +208,6 @@ def _same_seen(a: Moment, b: Moment) -> bool:
 
 
 def _drawn_parts(cell: Cell) -> tuple[object, ...]:
-    """What a cell looks like but for where its objects are; its parts are the same in a cell whose objects moved."""
+    """Return what a cell looks like, without the poses of its objects; equal for cells whose objects moved."""
     box = (*cell.box_min_m.tolist(), *cell.box_max_m.tolist())
     return (box, cell.static, cell.robot, [(body.name, body.mesh.sha256) for body in cell.objects])

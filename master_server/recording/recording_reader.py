@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording opened for reading: any moment of it, in the memory of one chunk.
+"""Read any moment of a recording, in the memory of one chunk.
 
-The file is read once from its beginning to find its chunks, so that one whose writer was killed is as good as another
+The file is scanned once from its start to find its chunks. So a file whose writer was killed can be read as any other,
 up to its end.
 """
 
@@ -31,7 +31,8 @@ from pydantic import BaseModel, ValidationError
 
 from master_server.core import MapView
 from master_server.recording.moment import (
-    FORMAT,
+    FORMAT_MAJOR,
+    FORMAT_MINOR,
     MAP_TOPIC,
     METADATA,
     SEEN_TOPIC,
@@ -51,16 +52,19 @@ from shared.settings import Settings
 logger = logging.getLogger(__name__)
 
 MAX_RECORD_BYTES = 2**30
-"""Chunks have a few MiB, meshes some hundred at most; a longer record is damage."""
+"""Chunks have a few MiB, meshes some hundred at most; a longer record means damage."""
 
 CHUNKS_KEPT = 4
-"""Unpacked at a time: who plays needs one, who moves to and fro a few."""
+"""Unpacked chunks in memory: a replay needs one, seeking back and forth a few."""
 
 PROGRESS_STEP_BYTES = 2**24
-"""Between two calls of `progress`."""
+"""Bytes between two calls of `progress`."""
 
 UNREADABLE = (McapError, struct.error, ValueError, OverflowError, zstandard.ZstdError)
-"""All ways in which the library says that bytes are damaged."""
+"""All errors of the library for damaged bytes."""
+
+UNKNOWN_REASON = "the recording says that the map was not complete, and not why"
+"""Reason of a moment that is not complete and has none: absence of a reason must not make it complete."""
 
 Progress = Callable[[int, int], None]
 Model = TypeVar("Model", bound=BaseModel)
@@ -78,7 +82,7 @@ class Frame(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """Where a record lies, and when its messages begin."""
+    """The position of a record, and the time of its first message."""
 
     offset: int
     length: int
@@ -105,16 +109,16 @@ class _Index:
 
 
 class Recording:
-    """A recording; a context, which closes it.
+    """An open recording; a context manager, which closes it.
 
     Attributes:
         begin_ns, end_ns: of the first and the last moment, since 1970.
-        trouble: why there may be less than was recorded, empty when nothing is missing.
+        trouble: the reason if something may be missing; empty otherwise.
         counts: messages by topic.
     """
 
     def __init__(self, path: Path, progress: Progress | None = None) -> None:
-        """Find what is in a file. `progress` is called with the bytes read and those in all.
+        """Index a file. `progress` is called with the bytes read and their total.
 
         Raises:
             SourceError: there is no such file, or it holds no moment of a master.
@@ -140,7 +144,7 @@ class Recording:
 
     @property
     def trouble(self) -> str:
-        """Why there may be less than was recorded."""
+        """The reason if something may be missing; empty otherwise."""
         return self._index.trouble
 
     @property
@@ -150,7 +154,7 @@ class Recording:
 
     @property
     def cells(self) -> list[dict[str, Any]]:
-        """The documents of all cells that were watched."""
+        """The documents of all watched cells."""
         return [self.cell(sha256) for sha256 in self._attached(cell_attachment(""))]
 
     @property
@@ -164,9 +168,9 @@ class Recording:
         return self._attached(cell_attachment(""))
 
     def at(self, log_ns: int) -> Frame:
-        """The last moment that is not after `log_ns`; the first one, if that is earlier."""
+        """Return the last moment at or before `log_ns`; the first moment, if that is later."""
         number = max(bisect_right(self._index.chunks, log_ns, key=_begin_of) - 1, 0)
-        # A chunk whose state messages come later than its first message, or a damaged one: what was before holds.
+        # A damaged chunk, or one whose state messages come after its first message: the earlier state holds.
         for place in reversed(self._index.chunks[: number + 1]):
             frames = self._unpacked(place)
             index = bisect_right(frames, log_ns, key=_log_of)
@@ -175,7 +179,7 @@ class Recording:
         return self._parsed(self._first)
 
     def after(self, log_ns: int) -> int | None:
-        """The time of the first moment after `log_ns`."""
+        """Return the time of the first moment after `log_ns`."""
         number = max(bisect_right(self._index.chunks, log_ns, key=_begin_of) - 1, 0)
         for place in self._index.chunks[number:]:
             frames = self._unpacked(place)
@@ -185,7 +189,7 @@ class Recording:
         return None
 
     def cell(self, sha256: str) -> dict[str, Any]:
-        """The document of a cell.
+        """Return the document of a cell.
 
         Raises:
             SourceError: it is missing or damaged.
@@ -197,11 +201,11 @@ class Recording:
         return document
 
     def mesh(self, sha256: str) -> bytes | None:
-        """A mesh in its canonical bytes, if it is there."""
+        """Return a mesh in its canonical bytes; None if it is missing."""
         return self._attachment(mesh_attachment(sha256))
 
     def forget(self) -> None:
-        """Let go of what was unpacked; it is unpacked again when it is asked for."""
+        """Drop the unpacked chunks from memory; they are unpacked again on demand."""
         self._unpacked.cache_clear()
         self._parsed.cache_clear()
 
@@ -211,14 +215,26 @@ class Recording:
 
     def _begin(self) -> None:
         index = self._index
-        if index.format != str(FORMAT):
-            raise SourceError(f"{self.path}: expected a master's recording of format {FORMAT}, got {index.format}")
+        major, minor = _version(index.format)
+        if major != FORMAT_MAJOR:
+            raise SourceError(
+                f"{self.path}: expected a master's recording of format {FORMAT_MAJOR}.x, got {index.format or 'none'}; "
+                "replay it with the version of Cellwatch that wrote it"
+            )
+        if minor > FORMAT_MINOR:
+            logger.warning(
+                "%s: its format %s is newer than %d.%d; what this version does not know of the status is ignored",
+                self.path,
+                index.format,
+                FORMAT_MAJOR,
+                FORMAT_MINOR,
+            )
         first = next(filter(None, map(self._unpacked, index.chunks)), None)
         last = next(filter(None, map(self._unpacked, reversed(index.chunks))), None)
         if first is None or last is None:
             raise SourceError(f"{self.path}: there is no whole chunk in it: {self.trouble}")
         self._first = first[0]
-        # What this version cannot read is told now, not to whom asks first.
+        # Reports what this version cannot read when the file is opened, not at the first request.
         self._parsed(self._first)
         self.begin_ns, self.end_ns = first[0].log_ns, last[-1].log_ns
 
@@ -227,15 +243,15 @@ class Recording:
         return None if place is None else Attachment.read(self._stream(place)).data
 
     def _stream(self, place: _Place) -> ReadDataStream:
-        """A record's content, behind its opcode and length."""
+        """Return a record's content, without its opcode and length."""
         return ReadDataStream(BytesIO(self._data[place.offset + 9 : place.offset + place.length]))
 
     def _unpack(self, place: _Place) -> tuple[_RawFrame, ...]:
-        """The moments of a chunk; none, if it is damaged."""
+        """Return the moments of a chunk; none if it is damaged."""
         try:
             records = breakup_chunk(Chunk.read(self._stream(place)), validate_crc=True)
         except UNREADABLE as error:
-            logger.warning("%s: a chunk at byte %d is damaged, passed over: %s", self.path, place.offset, error)
+            logger.warning("%s: the chunk at byte %d is damaged and skipped: %s", self.path, place.offset, error)
             return ()
         return tuple(_frames(records, self._index.channels))
 
@@ -249,13 +265,13 @@ class Recording:
                 merged.lattice_version,
                 keys,
                 witnesses,
-                state.reasons,
+                state.reasons if state.complete or state.reasons else (UNKNOWN_REASON,),
                 state.oldest_view_age_s,
                 state.units_live,
                 merged.reported(),
                 state.causes,
             )
-            settings = _checked(Settings, raw.settings)
+            settings = _settings(raw.settings)
             return Frame(raw.log_ns, state, view, seen.blocks.lattice(), seen.counts(), settings)
         except InputError as error:
             raise SourceError(f"{self.path}: {error}") from error
@@ -272,18 +288,18 @@ def _map(path: Path) -> mmap.mmap:
 
 
 def _index(path: Path, data: mmap.mmap, progress: Progress | None) -> _Index:
-    """Where everything lies, as far as the file can be read."""
+    """Index all records, as far as the file can be read."""
     index = _Index()
-    began, told = 0, 0
+    began, reported = 0, 0
     try:
         for record in StreamReader(cast(IO[bytes], data), emit_chunks=True, record_size_limit=MAX_RECORD_BYTES).records:
             ended = data.tell()
             began = max(began, 8)
             _note(index, record, _Place(began, ended - began))
             began = ended
-            if progress is not None and ended - told >= PROGRESS_STEP_BYTES:
+            if progress is not None and ended - reported >= PROGRESS_STEP_BYTES:
                 progress(ended, len(data))
-                told = ended
+                reported = ended
             if isinstance(record, Footer):
                 index.trouble = ""
     except UNREADABLE as error:
@@ -300,7 +316,7 @@ def _note(index: _Index, record: McapRecord, place: _Place) -> None:
     if isinstance(record, Chunk):
         index.chunks.append(place._replace(begin_ns=record.message_start_time))
         if not index.channels:
-            # Channels are made with the file, so they stand in its first chunk.
+            # Channels are made with the file, so they are in its first chunk.
             channels = breakup_chunk(record, validate_crc=True)
             index.channels = {channel.id: channel for channel in channels if isinstance(channel, Channel)}
     elif isinstance(record, MessageIndex):
@@ -312,7 +328,7 @@ def _note(index: _Index, record: McapRecord, place: _Place) -> None:
 
 
 def _frames(records: list[McapRecord], channels: dict[int, Channel]) -> Iterator[_RawFrame]:
-    """A state is the last message of its moment; what else belongs to it stands before it."""
+    """Yield moments. A state is the last message of its moment; the other messages of the moment precede it."""
     latest: dict[str, bytes] = {}
     for record in records:
         if not isinstance(record, Message) or record.channel_id not in channels:
@@ -321,6 +337,30 @@ def _frames(records: list[McapRecord], channels: dict[int, Channel]) -> Iterator
         latest[topic] = record.data
         if topic == STATE_TOPIC and {MAP_TOPIC, SEEN_TOPIC, SETTINGS_TOPIC} <= latest.keys():
             yield _RawFrame(record.log_time, record.data, latest[MAP_TOPIC], latest[SEEN_TOPIC], latest[SETTINGS_TOPIC])
+
+
+def _version(text: str | None) -> tuple[int, int]:
+    """Major and minor of a recording's format; (0, 0) if it has none that can be read."""
+    major, _, minor = (text or "").partition(".")
+    numbers = [int(part) if part.isascii() and part.isdigit() else 0 for part in (major, minor or "0")]
+    return numbers[0], numbers[1]
+
+
+def _settings(data: bytes) -> Settings:
+    """The recorded settings, without those of a later minor.
+
+    Raises:
+        InputError: a value that this version knows is wrong.
+    """
+    try:
+        fields = json.loads(data)
+        if isinstance(fields, dict):
+            fields = {name: fields[name] for name in Settings.model_fields if name in fields}
+        return Settings.model_validate(fields)
+    except ValidationError as error:
+        raise InputError(f"Settings: {sentence(error)}") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"Settings: expected JSON: {error}") from error
 
 
 def _checked(model: type[Model], data: bytes) -> Model:

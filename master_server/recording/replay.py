@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording that answers as the master did."""
+"""Answer from a recording as the master did."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from shared.messages import CellReference, RobotAnswer, UnitRow
 from shared.settings import Settings
 
 SPEED_MIN, SPEED_MAX = 0.01, 100.0
-"""From where the robot's single steps are seen to where a shift passes in five minutes."""
+"""Slow enough to see the robot's single steps; fast enough for a shift in five minutes."""
 
 LOOK_PERIOD_NS = 10 * NS_PER_MS
-"""Listeners are woken at most this often, however fast it plays."""
+"""Listeners are woken at most this often, at any speed."""
 
 
 class ReplayRequest(BaseModel):
-    """`PUT /replay`: what is left out stays as it is."""
+    """`PUT /replay`: an absent field stays as it is."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -38,22 +38,22 @@ class ReplayRequest(BaseModel):
 
 
 class ReplayAnswer(BaseModel):
-    """How the replay stands."""
+    """The state of the replay."""
 
-    file: str = Field(description="The file that is shown now.")
+    file: str = Field(description="The current file.")
     files: int = Field(description="How many files follow one another.")
     position_s: float
     duration_s: float
     speed: float
     playing: bool
     loop: bool
-    recorded_at_ns: int = Field(description="When what is shown now was recorded, nanoseconds since 1970.")
-    trouble: str = Field(description="Why there may be less than was recorded.")
+    recorded_at_ns: int = Field(description="Recording time of the current moment, nanoseconds since 1970.")
+    trouble: str = Field(description="The reason if part of the recording may be missing.")
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedCell:
-    """A cell as units and readers were given it."""
+    """A cell as units and readers received it."""
 
     reference: CellReference
     document: dict[str, Any]
@@ -61,9 +61,9 @@ class RecordedCell:
 
 
 class Replay:
-    """What a master answered at a time of its recording that goes on, or stands still; see `Readable`.
+    """The answers of a master at a time of its recording, which plays or is paused; see `Readable`.
 
-    Ages and reasons are those of that time, and so is the robot's clock.
+    Ages, reasons and the robot's clock are those of that time.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Replay:
         loop: bool = False,
         clock: Callable[[], int] = monotonic_ns,
     ) -> None:
-        """Plays from `start_s` at once. `clock` is asked by what has no time of its own, as `settings`."""
+        """Play from `start_s` at once. `clock` serves calls that receive no time, such as `settings`."""
         self.listeners: list[Callable[[], None]] = []
         self._recording = recording
         self._clock = clock
@@ -86,33 +86,33 @@ class Replay:
         self._since_ns = clock()
         self._cell: RecordedCell | None = None
 
-    # ------------------------------------------------------------------ what everyone asks
+    # ------------------------------------------------------------------ reads
 
     def view(self, now_ns: int) -> MapView:
-        """The merged map."""
+        """Return the merged map."""
         return self._frame(now_ns).view
 
     def blocks_at(self, now_ns: int) -> Lattice:
-        """The blocks that `seen_by` counts in."""
+        """Return the blocks of `seen_by`."""
         return self._frame(now_ns).blocks
 
     def seen_by(self, now_ns: int) -> NDArray[np.uint8]:
-        """How many live units looked through each block."""
+        """Return the number of live units that saw each block."""
         return self._frame(now_ns).seen_by
 
     def units(self, now_ns: int) -> list[UnitRow]:
-        """One row a unit."""
+        """Return one row for each unit."""
         return list(self._frame(now_ns).state.units)
 
     def unit_states(self, now_ns: int) -> list[UnitState]:
-        """Of each row what a stream tells."""
+        """Return the part of each row that a stream sends."""
         return [
             UnitState(row.id, row.ip, row.state, row.reason, row.cause, row.age_s, row.voxels)
             for row in self.units(now_ns)
         ]
 
     def robot_answer(self, since_ns: int | None, now_ns: int) -> RobotAnswer:
-        """The newest joints, or all after `since_ns`, by the clock of the recording."""
+        """Return the newest joints, or all after `since_ns`, by the clock of the recording."""
         robot = self._frame(now_ns).state.robot
         if since_ns is None:
             joints = robot.joints[-1:]
@@ -134,7 +134,7 @@ class Replay:
         return self._cell
 
     def next_change_ns(self, now_ns: int) -> int | None:
-        """When the next recorded moment is due; None when there is none to come by itself."""
+        """Return the time at which the next recorded moment is due; None while paused or at the end."""
         if not self._is_moving(now_ns):
             return None
         log_ns = self._recording.after(self._log_ns(now_ns))
@@ -145,7 +145,7 @@ class Replay:
     # ------------------------------------------------------------------ the player
 
     def answer(self, now_ns: int) -> ReplayAnswer:
-        """How it stands."""
+        """Return the state of the replay."""
         frame = self._frame(now_ns)
         return ReplayAnswer(
             file=self._recording.path.name,
@@ -160,7 +160,7 @@ class Replay:
         )
 
     def change(self, request: ReplayRequest, now_ns: int) -> ReplayAnswer:
-        """Go elsewhere, pause, or play at another speed; played on at its end it begins anew.
+        """Seek, pause, or play at another speed; playing on at the end starts anew.
 
         Raises:
             Refusal: 422, the recording is not that long.
@@ -168,7 +168,7 @@ class Replay:
         position_ns = self._position_ns(now_ns)
         if request.position_s is not None:
             position_ns = round(request.position_s * NS_PER_S)
-            # What `answer` said of the duration is rounded, and where it ends is a place in it.
+            # The duration in `answer` is rounded, and the end itself is a valid position.
             if position_ns > self._duration_ns + NS_PER_MS:
                 length = f"{self._duration_ns / NS_PER_S:.3f} s"
                 raise Refusal(422, f"position_s: expected at most {length}, got {request.position_s:g}")
@@ -209,7 +209,7 @@ class Replay:
 
 
 class _Meshes(Mapping[str, bytes]):
-    """The meshes of a recording, each read when it is asked for."""
+    """The meshes of a recording, each read on demand."""
 
     def __init__(self, recording: Timeline) -> None:
         self._recording = recording

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who may do what, and how often.
+"""Access control and rate limits.
 
 In the order of the flow:
 
     tokens       the files of the two tokens
-    auth         who may do what: two tokens
-    rate_limits  how much one address may ask for
+    auth         checks requests against the two tokens
+    rate_limits  bounds the requests of each address
 """
 
 from master_server.security.auth import Access, load_access

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who may do what: one token for units, one for operators, each for as long as it stands in its file."""
+"""Access control: one token for units and one for operators, each valid while its file holds it."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from shared.errors import ConfigError, Refusal
 
 logger = logging.getLogger(__name__)
 
-LOOK_EVERY_S = 0.1
-"""How often the tokens' files are read again: whoever replaces one wants the old one refused, and at 50 us in a thread
-it costs no request anything."""
+READ_EVERY_S = 0.1
+"""Period of reading the tokens' files: an operator who replaces a token wants the old one refused soon. It takes 50 us
+in a thread and delays no request."""
 
 UNITS = frozenset({Role.UNIT})
 OPERATORS = frozenset({Role.OPERATOR})
@@ -25,7 +25,7 @@ ANYONE = frozenset({Role.UNIT, Role.OPERATOR})
 
 @dataclass
 class Access:
-    """The two tokens, and whether reading needs one at all.
+    """The two tokens, and whether reading needs one.
 
     Attributes:
         state_dir: the folder with the files of the tokens, for `follow`.
@@ -40,7 +40,7 @@ class Access:
     )
 
     def check(self, authorization: bytes | None, allowed: frozenset[Role]) -> Role:
-        """The role of a request with this `Authorization` header.
+        """Return the role of a request with this `Authorization` header.
 
         Raises:
             Refusal: 401 without a valid token, 403 with one of another role.
@@ -51,7 +51,7 @@ class Access:
         if scheme.lower() != b"bearer":
             raise Refusal(401, "no bearer token: expected the header 'Authorization: Bearer <token>'")
         token = token.strip()
-        # Both are compared, each in constant time, so that timing tells nothing about either.
+        # Compare with both, each in constant time, so that timing reveals nothing about either.
         is_unit = hmac.compare_digest(token, self.unit_token)
         is_operator = hmac.compare_digest(token, self.operator_token)
         if not (is_unit or is_operator):
@@ -68,15 +68,15 @@ class Access:
             self.check(authorization, ANYONE)
 
     def token_of(self, role: Role) -> bytes:
-        """The token of a role, as it is now."""
+        """Return the current token of a role."""
         return self.unit_token if role is Role.UNIT else self.operator_token
 
     def end_of(self, role: Role) -> asyncio.Event:
-        """Set once the token that this role has now is replaced."""
+        """Return an event that is set once the current token of this role is replaced."""
         return self._ends[role]
 
     def replace(self, role: Role, token: bytes) -> None:
-        """From now on this is the token of the role, and the one before is refused."""
+        """Replace the token of the role; the old one is refused."""
         if role is Role.UNIT:
             self.unit_token = token
         else:
@@ -85,38 +85,38 @@ class Access:
         ended.set()
 
     async def follow(self) -> None:
-        """Take over each token whose file is replaced, until cancelled.
+        """Apply each replaced token file, until cancelled.
 
-        While a file is missing or holds no token, the one before stays.
+        While a file is missing or holds no token, the old token stays valid.
         """
         if self.state_dir is None:
             return
         seen: dict[Role, str] = {}
-        told: dict[Role, str] = {}
+        warned: dict[Role, str] = {}
         while True:
-            await asyncio.sleep(LOOK_EVERY_S)
-            for role, found in (await asyncio.to_thread(_look, self.state_dir)).items():
+            await asyncio.sleep(READ_EVERY_S)
+            for role, found in (await asyncio.to_thread(_read_files, self.state_dir)).items():
                 if isinstance(found, bytes):
                     seen.pop(role, None)
-                    told.pop(role, None)
+                    warned.pop(role, None)
                     if found != self.token_of(role):
                         self.replace(role, found)
                         logger.info(
-                            "%s was replaced: the token before is refused from now on",
+                            "%s was replaced: the old token is refused from now on",
                             token_file(self.state_dir, role),
                             extra={"event": "token"},
                         )
                     continue
                 trouble = str(found)
-                # Only at the second look, for who writes a file in place empties it first.
-                if seen.get(role) == trouble and told.get(role) != trouble:
-                    logger.warning("%s; the token before stays in force", trouble, extra={"event": "token"})
-                    told[role] = trouble
+                # Warn only at the second read: an editor that writes a file in place empties it first.
+                if seen.get(role) == trouble and warned.get(role) != trouble:
+                    logger.warning("%s; the old token stays valid", trouble, extra={"event": "token"})
+                    warned[role] = trouble
                 seen[role] = trouble
 
 
 def load_access(state_dir: Path, public_reads: bool) -> Access:
-    """Read the tokens in `state_dir`; make what is missing.
+    """Read the tokens in `state_dir`; make missing ones.
 
     Raises:
         ConfigError: the folder or a file cannot be read or written, or a file holds no token.
@@ -125,8 +125,8 @@ def load_access(state_dir: Path, public_reads: bool) -> Access:
     return Access(read_token(state_dir, Role.UNIT), read_token(state_dir, Role.OPERATOR), public_reads, state_dir)
 
 
-def _look(state_dir: Path) -> dict[Role, bytes | ConfigError]:
-    """What stands in the files now, or why that is no token."""
+def _read_files(state_dir: Path) -> dict[Role, bytes | ConfigError]:
+    """Return the tokens in the files now, or the error for each file."""
     found: dict[Role, bytes | ConfigError] = {}
     for role in Role:
         try:

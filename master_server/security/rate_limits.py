@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much one address may ask for, so that none takes the master from the others."""
+"""Bound the requests of each address, so that none takes the master away from the others."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from shared.clock import NS_PER_S
 from shared.errors import Refusal
 
 REQUESTS_PER_S = 1000.0
-"""A robot's controller that tells joints at 500 Hz and reads the map at 100 Hz beside a unit of 90 fps stays below."""
+"""Above the load of a controller that sends joints at 500 Hz and reads the map at 100 Hz beside a unit of 90 fps."""
 
 REQUESTS_BURST = 2000
-"""Two seconds of them at once: what piled up while a network was away."""
+"""Two seconds of requests at once: the backlog after a network outage."""
 
 BODY_BYTES_A_REQUEST = 2**15
-"""So much of a body counts as one more request: the largest update, 1 MiB, passes 30 times a second."""
+"""This much of a body counts as one more request: the largest update, 1 MiB, passes 30 times a second."""
 
 WRONG_TOKENS_PER_S = 1.0
 WRONG_TOKENS_BURST = 20
-"""A unit whose token was replaced tries four times a second; beyond the burst it is heard once a second."""
+"""A unit whose token was replaced tries four times a second; beyond the burst, one try a second is checked."""
 
 TRUSTED_S = 60.0
-"""An address that showed a valid token is not shut out for another's guesses at the same address for so long."""
+"""Time for which an address with a valid token is not blocked by the wrong tokens of others at the same address."""
 
 COMPLAINTS_PER_S = 1.0
 COMPLAINTS_BURST = 20
-"""Lines of the log about one address: enough to see what is wrong, too few to fill a disk."""
+"""Lines of the log about one address: enough to find the fault, too few to fill a disk."""
 
 CONNECTIONS_PER_S = 250.0
 CONNECTIONS_BURST = 500
-"""A script that connects anew for joints at 125 Hz stays below."""
+"""Above the rate of a script that opens a connection for each joint sample at 125 Hz."""
 
 CONNECTIONS_PER_ADDRESS = 64
 """A unit holds four, a browser six."""
@@ -39,24 +39,24 @@ CONNECTIONS_MAX = 512
 """Twice what 64 units hold, and half of the 1024 files that a process may open by default."""
 
 STRANGERS_MAX = 256
-"""Of these, for addresses that have shown no valid token lately: a crowd of them shuts no unit out."""
+"""Part of these for addresses without a recent valid token, so that a crowd of them never blocks a unit."""
 
 ADDRESSES_MAX = 4096
-"""Remembered; beyond, the one that came first is forgotten, which only loosens its limit."""
+"""Addresses in each table; beyond, the oldest is dropped, which only loosens its limit."""
 
 IPV4_PREFIX = "::ffff:"
-"""IPv4 addresses look like this on a socket for both."""
+"""Prefix of IPv4 addresses on a dual-stack socket."""
 
 Value = TypeVar("Value")
 
 
 def plain_ip(address: str) -> str:
-    """One name for one address, whichever kind of socket it came by."""
+    """Return one form of an address, for both kinds of sockets."""
     return address.removeprefix(IPV4_PREFIX)
 
 
 class RateLimit:
-    """A token bucket for each address, kept as the one time at which it will be full again."""
+    """A token bucket for each address, stored as the time at which it will be full again."""
 
     def __init__(self, per_s: float, burst: int) -> None:
         self._cost_ns = round(NS_PER_S / per_s)
@@ -67,11 +67,11 @@ class RateLimit:
         return len(self._full_at_ns)
 
     def wait_ns(self, ip: str, now_ns: int) -> int:
-        """How long until `ip` may ask for one more; 0 or less: now."""
+        """Return the time until `ip` may send one more request; 0 or less means now."""
         return self._full_at_ns.get(ip, 0) + self._cost_ns - now_ns - self._window_ns
 
     def spend(self, ip: str, now_ns: int, count: float = 1) -> None:
-        """Count what `ip` has asked for, allowed or not."""
+        """Count requests of `ip`, allowed or not."""
         full_at_ns = max(self._full_at_ns.get(ip, 0), now_ns) + round(count * self._cost_ns)
         _remember(self._full_at_ns, ip, full_at_ns)
 
@@ -88,7 +88,7 @@ class Limits:
         self._open: dict[str, int] = {}
         self._open_count = 0
         self.turned_away = {"request": 0, "token": 0, "connection": 0}
-        """How many of each were, since the start."""
+        """Count of each refusal since the start."""
 
     def admit(self, ip: str, now_ns: int) -> None:
         """Count a request.
@@ -103,21 +103,21 @@ class Limits:
         self.requests.spend(ip, now_ns)
 
     def read(self, ip: str, body_bytes: int, now_ns: int) -> None:
-        """Count a body that was read; the request after it may be refused for it."""
+        """Count the body of a request after it was read; the next request may be refused for it."""
         self.requests.spend(ip, now_ns, body_bytes / BODY_BYTES_A_REQUEST)
 
     def may_be_logged(self, ip: str, now_ns: int) -> bool:
-        """Whether the log has room for one more line about this address; if so it is counted."""
+        """Return True and count a line if the log has room for one more line about this address."""
         if self._complaints.wait_ns(ip, now_ns) > 0:
             return False
         self._complaints.spend(ip, now_ns)
         return True
 
     def may_show_token(self, ip: str, now_ns: int) -> None:
-        """Before a token is looked at.
+        """Check the limit before a token is compared.
 
         Raises:
-            Refusal: 429, this address has shown too many wrong ones and no right one lately.
+            Refusal: 429, this address has shown too many wrong tokens and no valid one lately.
         """
         wait_ns = self.wrong_tokens.wait_ns(ip, now_ns)
         if wait_ns > 0 and not self._is_trusted(ip, now_ns):
@@ -125,17 +125,17 @@ class Limits:
             raise _too_many(f"token: {ip} has shown too many wrong ones", wait_ns)
 
     def token_was_wrong(self, ip: str, now_ns: int) -> None:
-        """Count a guess."""
-        # No debt: a unit that was trusted for a minute and is out of it is heard within a second, not within minutes.
+        """Count a wrong token."""
+        # No debt: a unit whose trusted time has ended is checked again within a second, not within minutes.
         if self.wrong_tokens.wait_ns(ip, now_ns) <= 0:
             self.wrong_tokens.spend(ip, now_ns)
 
     def token_was_right(self, ip: str, now_ns: int) -> None:
-        """From now on this address is trusted for a while."""
+        """Trust this address for `TRUSTED_S`."""
         _remember(self._trusted_at_ns, ip, now_ns)
 
     def connect(self, ip: str, now_ns: int) -> bool:
-        """Whether this address may have one more connection; if so it is counted until `disconnect`."""
+        """Return True and count the connection until `disconnect` if this address may have one more."""
         open_here = self._open.get(ip, 0)
         open_max = CONNECTIONS_MAX if self._is_trusted(ip, now_ns) else STRANGERS_MAX
         if (
@@ -151,7 +151,7 @@ class Limits:
         return True
 
     def disconnect(self, ip: str) -> None:
-        """One of its connections is closed."""
+        """Count a closed connection of this address."""
         self._open_count -= 1
         if self._open[ip] == 1:
             del self._open[ip]
@@ -163,7 +163,7 @@ class Limits:
 
     @property
     def connections(self) -> int:
-        """How many are open."""
+        """Number of open connections."""
         return self._open_count
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The files of the two tokens: made at the first start, read again while the master runs, replaced on request.
 
-Only the master's user can read them, and what stands in them is never logged.
+Only the master's user can read them, and their content is never logged.
 """
 
 from __future__ import annotations
@@ -19,49 +19,49 @@ from shared.files import write_private
 logger = logging.getLogger(__name__)
 
 TOKEN_BYTES = 32
-"""256 bits of randomness: nobody guesses it, whatever the rate."""
+"""256 bits of randomness: impossible to guess at any rate."""
 
 TOKEN_MIN_CHARS = 16
-"""Shorter is an accident with an editor, not a token."""
+"""A shorter one is an accident with an editor, not a token."""
 
 TOKEN_MAX_CHARS = 256
-"""Longer than any token; bounds what is compared."""
+"""Longer than any token; bounds the comparison."""
 
 FILE_MAX_BYTES = 4096
-"""What is read of a file; what stands beyond makes it no token."""
+"""Bytes read from a file; a longer file is no token."""
 
 OTHERS = stat.S_IRWXG | stat.S_IRWXO
 
 
 class Role(Enum):
-    """Whose token it is."""
+    """The two users of the API; each has a token."""
 
     UNIT = "unit"
     OPERATOR = "operator"
 
 
 def token_file(state_dir: Path, role: Role) -> Path:
-    """Where the token of a role lies."""
+    """Return the path of a role's token."""
     return state_dir / f"{role.value}.token"
 
 
 def read_token(state_dir: Path, role: Role) -> bytes:
-    """The token of a role; a file that others can read is closed to them.
+    """Read the token of a role; if others can read the file, restrict its mode.
 
     Raises:
-        ConfigError: the file cannot be read or closed, or holds no token.
+        ConfigError: the file cannot be read or restricted, or holds no token.
     """
     path = token_file(state_dir, role)
     try:
-        # A pipe in its place must not hold us.
+        # A pipe at this path must not block.
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
             if os.fstat(file.fileno()).st_mode & OTHERS:
-                logger.warning("%s can be read by others: closing it (mode 0600)", path)
+                logger.warning("%s was readable by others: its mode is now 0600", path)
                 os.fchmod(file.fileno(), 0o600)
             token = file.read(FILE_MAX_BYTES).strip()
     except OSError as error:
         raise ConfigError(
-            f"{path}: cannot read the {role.value} token, or close it to others: {error.strerror}"
+            f"{path}: cannot read the {role.value} token, or set its mode to 0600: {error.strerror}"
         ) from error
     if not TOKEN_MIN_CHARS <= len(token) <= TOKEN_MAX_CHARS or not all(33 <= byte <= 126 for byte in token):
         raise ConfigError(
@@ -72,10 +72,10 @@ def read_token(state_dir: Path, role: Role) -> bytes:
 
 
 def make_missing(state_dir: Path) -> None:
-    """Make the folder, and each token that it has not.
+    """Make the folder and each missing token.
 
     Raises:
-        ConfigError: something cannot be made.
+        ConfigError: the folder or a file cannot be made.
     """
     try:
         state_dir.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -87,12 +87,12 @@ def make_missing(state_dir: Path) -> None:
 
 
 def write_token(state_dir: Path, role: Role) -> Path:
-    """Write a new token in place of the one that is there, if any; returns where it lies.
+    """Write a new token, replacing an old one; return its path.
 
-    It belongs to whom the folder belongs to, for that is who runs the master.
+    The file belongs to the owner of the folder, since that user runs the master.
 
     Raises:
-        ConfigError: the folder is missing or another's, or the file cannot be written; the old token stays.
+        ConfigError: the folder is missing or another user's, or the file cannot be written; the old token stays.
     """
     path = token_file(state_dir, role)
     try:
@@ -100,7 +100,7 @@ def write_token(state_dir: Path, role: Role) -> Path:
         user = os.geteuid()
         if user not in (0, folder.st_uid):
             raise ConfigError(
-                f"{state_dir}: expected to be run by the user that it belongs to (number {folder.st_uid}) or by root, "
+                f"{state_dir}: expected its owner (user number {folder.st_uid}) or root to run this, "
                 f"got user number {user}: the master could not read the token"
             )
         owner = (folder.st_uid, folder.st_gid) if user == 0 else None

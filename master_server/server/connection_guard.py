@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sockets held within bounds: how many, for how long without a whole request, with how long a head, and TLS.
+"""Bound the connections: their number, the time for a whole request, the size of its head. Serves TLS.
 
-The server below bounds none of these by itself. Connections are counted before the first byte of TLS is read, since
-a handshake costs more than most requests.
+Uvicorn bounds none of these by itself. Connections are counted before the first byte of TLS is read, since a handshake
+costs more than most requests.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from shared.errors import ConfigError
 logger = logging.getLogger(__name__)
 
 HEAD_S = 5.0
-"""From a connection, or the first byte of a request, to the end of its headers; also for a TLS handshake."""
+"""Time from a connection, or the first byte of a request, to the end of its headers; also for a TLS handshake."""
 
 MESSAGE_S = 65.0
-"""For a whole request, whatever reads it; the largest, a cell as a zip, is given 60 s, and most much less."""
+"""Time for any whole request; the largest, a cell as a zip, has 60 s, and most have much less."""
 
 MAX_HEAD_BYTES = 2**14
-"""Of a request's line and headers; ours take a hundredth of it, a browser's a tenth."""
+"""Largest request line with headers; our clients need a hundredth of it, a browser a tenth."""
 
 ACCEPT_AGAIN_S = 0.1
-"""Before the next attempt when the system gave none."""
+"""Delay before the next attempt when the system could give no connection."""
 
 RESET = struct.pack("ii", 1, 0)
 """For SO_LINGER: closing sends a reset."""
 
 NOISE = ("Invalid HTTP request received.", "Unsupported upgrade request.")
-"""What strangers can have written into the log as often as they like."""
+"""Lines that a stranger could write to the log without limit."""
 
 
 def server_context(certificate: Path, key: Path) -> ssl.SSLContext:
-    """TLS 1.2 or later with this certificate (PEM, with what chain it needs) and its key.
+    """Return TLS 1.2 or later with this certificate (PEM, with its chain if needed) and its key.
 
     Raises:
         ConfigError: a file cannot be read, is no PEM, is encrypted, or the two do not belong together.
@@ -58,7 +58,7 @@ def server_context(certificate: Path, key: Path) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     try:
-        # An empty password, or a person would be asked for one.
+        # An empty password, since the library would otherwise prompt for one.
         context.load_cert_chain(certificate, key, password="")
     except (ssl.SSLError, ValueError) as error:
         reason = getattr(error, "reason", None) or str(error)
@@ -70,7 +70,7 @@ def server_context(certificate: Path, key: Path) -> ssl.SSLContext:
 
 
 def fingerprint(certificate: Path) -> str:
-    """The sha256 of the first certificate in a PEM file, as units may be told it."""
+    """Return the sha256 of the first certificate in a PEM file, in the form of a unit's configuration."""
     text = certificate.read_text(encoding="ascii", errors="replace")
     begin, end = text.index(ssl.PEM_HEADER), text.index(ssl.PEM_FOOTER)
     der = ssl.PEM_cert_to_DER_cert(text[begin : end + len(ssl.PEM_FOOTER)])
@@ -78,7 +78,7 @@ def fingerprint(certificate: Path) -> str:
 
 
 class Acceptor:
-    """Takes connections in, for as long as it is not closed."""
+    """Accept connections until it is closed."""
 
     def __init__(
         self,
@@ -94,12 +94,12 @@ class Acceptor:
         self._tasks: set[asyncio.Task[None]] = set()
 
     def start(self) -> None:
-        """Begin; needs a running event loop."""
+        """Start; needs a running event loop."""
         self._listener.setblocking(False)
         self._begin(self._accept())
 
     def close(self) -> None:
-        """Take none in any more, and give up on those that are still shaking hands."""
+        """Stop accepting, and cancel unfinished TLS handshakes."""
         for task in self._tasks:
             task.cancel()
 
@@ -114,8 +114,8 @@ class Acceptor:
             try:
                 connection, address = await loop.sock_accept(self._listener)
             except OSError as error:
-                # The caller is gone already, or the process has no file left.
-                logger.warning("cannot take a connection in: %s", error)
+                # The caller is gone already, or the process has no file descriptor left.
+                logger.warning("cannot accept a connection: %s", error)
                 await asyncio.sleep(ACCEPT_AGAIN_S)
                 continue
             ip, now_ns = plain_ip(str(address[0])), monotonic_ns()
@@ -123,9 +123,9 @@ class Acceptor:
                 self._begin(self._shake_hands(connection, ip))
             else:
                 if self._limits.may_be_logged(ip, now_ns):
-                    text = "a connection of %s is turned away, %d are open"
+                    text = "a connection of %s is refused, %d are open"
                     logger.warning(text, ip, self._limits.connections, extra={"event": "connection", "ip": ip})
-                # Reset, so that nothing of it is kept waiting on our side.
+                # Reset the connection, so that none of its data stays queued on our side.
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
                 connection.close()
 
@@ -140,18 +140,18 @@ class Acceptor:
                 ssl_handshake_timeout=None if self._tls is None else HEAD_S,
             )
         except OSError:
-            # No TLS, too slow, or gone; ssl.SSLError is one of these.
+            # The caller speaks no TLS, is too slow, or is gone; ssl.SSLError is an OSError.
             connection.close()
         finally:
-            if not protocol.begun:
+            if not protocol.started:
                 self._limits.disconnect(ip)
 
 
 class GuardedHttp(HttpToolsProtocol):
-    """One connection, of which no more is taken than one of ours needs."""
+    """One connection, bounded to the needs of our clients."""
 
     leave: Callable[[], None] | None = None
-    begun = False
+    started = False
     _deadline: asyncio.TimerHandle | None = None
     _allowed_s: float | None = None
     _begins_anew = False
@@ -160,12 +160,12 @@ class GuardedHttp(HttpToolsProtocol):
 
     # The base narrows the type as well.
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        self.begun = True
+        self.started = True
         super().connection_made(transport)
-        self._give(HEAD_S)
+        self._set_timer(HEAD_S)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._give(None)
+        self._set_timer(None)
         if self.leave is not None:
             self.leave()
         super().connection_lost(exc)
@@ -179,44 +179,44 @@ class GuardedHttp(HttpToolsProtocol):
             if self._head_bytes > MAX_HEAD_BYTES:
                 self.send_400_response(f"Expected a head of at most {MAX_HEAD_BYTES} bytes.")
         if self.transport.is_closing():
-            # Also for one who does not read why.
-            self._give(HEAD_S)
+            # Also closes the connection of a client that does not read the answer.
+            self._set_timer(HEAD_S)
         elif self._begins_anew:
-            # Once for all that came: a request that came whole needs no timer.
-            self._give(self._allowed_s)
+            # Once for all data that came: a request that came whole needs no timer.
+            self._set_timer(self._allowed_s)
 
     def on_message_begin(self) -> None:
         super().on_message_begin()
         self._in_head, self._head_bytes = True, 0
-        self._allow(HEAD_S)
+        self._set_timer_from_end(HEAD_S)
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        # What comes after a body is no header that anyone asks for.
+        # Ignore trailers after a body: nothing uses them.
         if self._in_head:
             super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
         self._in_head = False
-        self._allow(MESSAGE_S)
+        self._set_timer_from_end(MESSAGE_S)
         super().on_headers_complete()
 
     def on_message_complete(self) -> None:
-        self._allow(None)
+        self._set_timer_from_end(None)
         super().on_message_complete()
 
     def handle_websocket_upgrade(self) -> None:
-        self._allow(None)
+        self._set_timer_from_end(None)
         super().handle_websocket_upgrade()
         protocol = self.transport.get_protocol()
         if isinstance(protocol, ReaderSocket):
             protocol.leave, self.leave = self.leave, None
 
-    def _allow(self, seconds: float | None) -> None:
-        """For what comes next, from the end of what has come already."""
+    def _set_timer_from_end(self, seconds: float | None) -> None:
+        """Limit the time of the next part, counted from the end of the data that came already."""
         self._allowed_s, self._begins_anew = seconds, True
 
-    def _give(self, seconds: float | None) -> None:
-        """Until the connection is closed, unless this is called again."""
+    def _set_timer(self, seconds: float | None) -> None:
+        """Close the connection after `seconds`, unless this is called again."""
         self._begins_anew = False
         if self._deadline is not None:
             self._deadline.cancel()
@@ -224,5 +224,5 @@ class GuardedHttp(HttpToolsProtocol):
 
 
 def quiet(record: logging.LogRecord) -> bool:
-    """A filter for the log of the server below."""
+    """Filter such lines from the log of the web server."""
     return not str(record.msg).startswith(NOISE)

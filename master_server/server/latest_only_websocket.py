@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The web server's WebSocket, for readers that must hear what is true now: what cannot be sent at once is not kept.
+"""The web server's WebSocket for readers of the current state: it drops a message that cannot be sent at once.
 
-By itself a socket takes megabytes for a reader that does not read, which are seconds of a map that is long past.
+Without this, the socket buffers megabytes for a reader that does not read, which are seconds of an outdated map.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from typing import Any
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 UNSENT_MAX_BYTES = 2**14
-"""What the kernel may hold that is not under way yet; then the writer waits, and takes the newest afterwards."""
+"""Bytes not yet sent that the kernel may hold; beyond, the writer waits and sends the newest state afterwards."""
 
 PING_S = 5.0
-"""A reader that is gone, or does not read, is let go after two of these at most."""
+"""A reader that is gone or does not read is disconnected after at most two of these."""
 
 CLOSE_S = 0.5
-"""For a reader to hear that it is let go; whoever does not read is let go without."""
+"""Time for a reader to receive the close message; without reading it is disconnected anyway."""
 
 MESSAGE_MAX_BYTES = 2**12
-"""Readers have nothing to say but that they go."""
+"""Largest message from a reader; readers send next to nothing."""
 
 
 class ReaderSocket(WebSocketsSansIOProtocol):
-    """Holds back at most one message, and lets go of who does not answer."""
+    """Keep at most one waiting message, and disconnect a reader that does not answer."""
 
     leave: Callable[[], None] | None = None
-    """Told when the connection has ended."""
+    """Called when the connection has ended."""
 
     def connection_made(self, transport: BaseTransport) -> None:
         super().connection_made(transport)
@@ -52,7 +52,7 @@ class ReaderSocket(WebSocketsSansIOProtocol):
 
     def keepalive_timeout(self) -> None:
         super().keepalive_timeout()
-        # Closing would first wait for all to be read, by one who does not read.
+        # A normal close would first wait until a reader that does not read has read everything.
         self.transport.abort()
 
 
@@ -61,7 +61,7 @@ SERVER_OPTIONS: dict[str, Any] = {
     "ws_ping_interval": PING_S,
     "ws_ping_timeout": PING_S,
     "ws_max_size": MESSAGE_MAX_BYTES,
-    # It would be done anew for each reader, at more than the cost of making the message.
+    # It would be computed for each reader, at more than the cost of making the message.
     "ws_per_message_deflate": False,
 }
 """For `uvicorn.Config`."""

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The operator's window: the cell in a browser, at the master's own port under `/viewer/`.
+"""The viewer for operators: the cell in a browser, at the master's own port under `/viewer/`.
 
-It is drawn by viser in a process of its own, which the master starts when someone looks and which ends when nobody
-does any more; that process listens on loopback only, has none of the master's tokens, and is reached through the
-master alone. In the order of the flow:
+viser draws it in its own process. The master starts that process for the first browser, and it ends some time after the
+last one has left. It listens on loopback only, has none of the master's tokens, and is reached only through the
+master. In the order of the flow:
 
-    sessions   who may look, and who may change something: links that work once, and cookies
-    messages   what the master and that process say to each other
-    channel    the same as bytes
-    snapshot   what one look at the master tells
+    sessions   access to the viewer: links that work once, and cookies
+    messages   the messages between the master and that process
+    channel    sends them over a socket pair
+    snapshot   the master's state for one refresh of the viewer
     host       that process, started and served by the master
-    proxy      the page and its socket as HTTP
-    scene      the cell, drawn
+    proxy      the page and its WebSocket as HTTP
+    scene      draws the cell
     panel      the table, plots and controls beside it
     window     the process itself
 """

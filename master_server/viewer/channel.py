@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests and answers between the master and its viewer: msgpack with a length before it, over a socket pair.
+"""Requests and answers between the viewer and the master: msgpack with a length prefix, over a socket pair.
 
-The viewer asks and the master answers, never the other way round; so the viewer is never sent more than it takes.
+Only the viewer sends requests, and only the master answers. So the viewer never receives more than it requested.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ MESSAGE_MAX_BYTES = 2**26
 """A map of 2**18 voxels takes 1.3 MB, a mesh at most some 30."""
 
 CONVERSATION_S = 15.0
-"""An answer that took longer is of no use to anyone in front of a window; a picture takes up to 5 s."""
+"""A later answer is of no use to a user in front of a browser; an image takes up to 5 s."""
 
 
 def pack(number: int, message: ViewerMessage) -> bytes:
-    """A request, or the answer to the request of this number, as it travels."""
+    """Encode a request, or the answer to the request of this number."""
     data: bytes = msgpack.packb((number, message.model_dump()))
     return LENGTH.pack(len(data)) + data
 
@@ -49,10 +49,10 @@ def _length(head: bytes) -> int:
 
 
 async def receive(reader: asyncio.StreamReader) -> tuple[int, Request] | None:
-    """The next request and its number; None at the end.
+    """Return the next request and its number; None at the end.
 
     Raises:
-        WireError: it is absurdly long, or none that the viewer makes.
+        WireError: the request is too long, or is no valid request of the viewer.
     """
     try:
         length = _length(await reader.readexactly(LENGTH.size))
@@ -69,8 +69,8 @@ def _unpacked(data: bytes) -> tuple[int, object]:
     return int(number), fields
 
 
-class Asker:
-    """The viewer's end: any thread may ask; answers come in any order."""
+class MasterChannel:
+    """The viewer's end of the channel: any thread may send requests; answers come in any order."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection
@@ -78,12 +78,12 @@ class Asker:
         self._waiting: dict[int, Future[object]] = {}
         self._numbers = itertools.count()
 
-    def ask(self, request: ViewerMessage, kind: type[Answer]) -> Answer:
-        """The master's answer, which is of this kind.
+    def request(self, request: ViewerMessage, kind: type[Answer]) -> Answer:
+        """Send a request and return the master's answer, which has type `kind`.
 
         Raises:
-            Refusal: 500, the master refuses, or answers something else.
-            WireError: there was none within `CONVERSATION_S`, or the master is gone.
+            Refusal: 500, the master refuses, or its answer has another type.
+            WireError: no answer came within `CONVERSATION_S`, or the master has ended.
         """
         number = next(self._numbers)
         answer: Future[object] = Future()
@@ -95,12 +95,12 @@ class Asker:
         except TookTooLong as error:
             raise WireError(f"the master did not answer within {CONVERSATION_S:g} s") from error
         except OSError as error:
-            raise WireError(f"the master is gone: {error}") from error
+            raise WireError(f"the master has ended: {error}") from error
         finally:
             self._waiting.pop(number, None)
 
     def listen(self) -> None:
-        """Hand out answers until the master is gone."""
+        """Deliver answers to the waiting threads until the master ends."""
         while (message := self._receive()) is not None:
             number, fields = message
             waiting = self._waiting.get(number)

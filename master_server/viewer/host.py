@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The viewer's process, started and served by the master.
 
-What it draws and sends takes time that updates would otherwise wait for. It is started with the first who looks, and
-ends by itself when nobody does; a viewer that fails takes nothing with it.
+Drawing and sending take time that updates would have to wait for, so they have their own process. It starts with the
+first browser and ends by itself some time after the last. Its failure does not affect the master.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from master_server.viewer.messages import (
     ApiRequest,
     BeginAnswer,
     BeginRequest,
-    LookRequest,
     ReadyAnswer,
     ReadyRequest,
     RefusedAnswer,
     Request,
+    StateRequest,
     ViewerMessage,
 )
 from master_server.viewer.sessions import Viewer
-from master_server.viewer.snapshot import look
+from master_server.viewer.snapshot import viewer_state
 from shared.clock import monotonic_ns
 from shared.errors import Refusal, WireError
 from shared.waiting import within
@@ -47,29 +47,29 @@ logger = logging.getLogger(__name__)
 WINDOW = "master_server.viewer.window"
 
 START_S = 30.0
-"""For the process to be there on a slow and busy machine; 1.5 s on a quiet one."""
+"""Time for the process to start on a slow and busy machine; it takes 1.5 s on an idle one."""
 
 STOP_S = 0.5
-"""Until it is killed."""
+"""Time for the process to end before it is killed."""
 
-ASKS_MAX = 16
-"""Requests of all who look that are under way at once; who clicks on is told to wait."""
+REQUESTS_MAX = 16
+"""Requests of all browsers in progress at once; further ones are refused until one is done."""
 
 LOCAL = "http://127.0.0.1"
 
 
 def is_installed() -> bool:
-    """Whether there is anything to draw with."""
+    """Return True if viser is installed."""
     return find_spec("viser") is not None
 
 
 class ViewerHost:
-    """One viewer process at most, and what it asks."""
+    """At most one viewer process, and the answers to its requests."""
 
     def __init__(
         self, app: ASGIApp, master: Readable, history: History, access: Access, actions: dict[str, str]
     ) -> None:
-        """`actions` of an operator on a unit: what a button says, and the address that it posts to."""
+        """`actions` of an operator on a unit: the text of each button, and the address for its POST."""
         self._app = app
         self._master = master
         self._history = history
@@ -85,14 +85,14 @@ class ViewerHost:
 
     @property
     def is_running(self) -> bool:
-        """Whether the process is there."""
+        """True while the process runs."""
         return self._process is not None and self._process.returncode is None and self._serving is not None
 
     async def open(self) -> None:
-        """Have it run, and its `port` and `key` known.
+        """Start the process if it does not run, and wait until its `port` and `key` are known.
 
         Raises:
-            Refusal: 503, it does not start.
+            Refusal: 503, the process does not start.
         """
         async with self._starting:
             if self.is_running and self._ready.is_set():
@@ -113,7 +113,7 @@ class ViewerHost:
         process, self._process = self._process, None
         if process is None or process.returncode is not None:
             return
-        # The channel is closed by now, by which it knows.
+        # The channel is closed by now, which ends the process.
         if not await within(STOP_S, process.wait()):
             process.kill()
             await process.wait()
@@ -131,7 +131,7 @@ class ViewerHost:
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=asyncio.subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(),),
-                # A window is not what the machine is there for; and where numerics spread over all cores, updates wait.
+                # The viewer has a low priority; and if numerics used all cores, updates would wait.
                 env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
                 start_new_session=True,
             )
@@ -141,10 +141,10 @@ class ViewerHost:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
-            while (asked := await receive(reader)) is not None:
-                number, request = asked
-                if isinstance(request, ApiRequest) and len(self._asks) < ASKS_MAX:
-                    self._begin(self._ask(number, request, writer))
+            while (received := await receive(reader)) is not None:
+                number, request = received
+                if isinstance(request, ApiRequest) and len(self._asks) < REQUESTS_MAX:
+                    self._begin(self._call_api(number, request, writer))
                     continue
                 writer.write(pack(number, self._answer(request)))
                 await writer.drain()
@@ -156,10 +156,10 @@ class ViewerHost:
             self._serving = None
 
     def _answer(self, request: Request) -> ViewerMessage:
-        """What can be told at once."""
-        if isinstance(request, LookRequest):
+        """Answer a request that needs no waiting."""
+        if isinstance(request, StateRequest):
             try:
-                return look(self._master, self._history, request, monotonic_ns())
+                return viewer_state(self._master, self._history, request, monotonic_ns())
             except Refusal as refusal:
                 # A recording may be damaged in its middle.
                 return RefusedAnswer(refused=str(refusal))
@@ -169,19 +169,19 @@ class ViewerHost:
             self.port = request.port
             self._ready.set()
             return ReadyAnswer()
-        return ApiAnswer(status=429, body=b'{"detail": "too much is asked at once"}')
+        return ApiAnswer(status=429, body=b'{"detail": "viewer: too many requests are in progress; try again"}')
 
     def _begin(self, work: Coroutine[None, None, None]) -> None:
         task = asyncio.ensure_future(work)
         self._asks.add(task)
         task.add_done_callback(self._asks.discard)
 
-    async def _ask(self, number: int, request: ApiRequest, writer: asyncio.StreamWriter) -> None:
-        """Answer by the same API that anyone may ask, as the person who looks may ask it."""
+    async def _call_api(self, number: int, request: ApiRequest, writer: asyncio.StreamWriter) -> None:
+        """Answer with the master's own API, with the rights of the browser that sent the request."""
         if request.method != "GET" and request.viewer is not Viewer.OPERATOR:
             status, body = 403, b'{"detail": "this needs the token of the operator"}'
         else:
-            # Without the way through sockets and TLS.
+            # Calls the application directly, without sockets and TLS.
             async with httpx.AsyncClient(transport=httpx.ASGITransport(self._app), base_url=LOCAL) as client:
                 response = await client.request(
                     request.method,
@@ -194,4 +194,4 @@ class ViewerHost:
             writer.write(pack(number, ApiAnswer(status=status, body=body)))
             await writer.drain()
         except ConnectionError:
-            logger.debug("viewer: it is gone before it was answered")
+            logger.debug("viewer: it ended before the answer was sent")

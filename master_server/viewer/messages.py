@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the viewer's process asks of the master, and what it is answered, as models."""
+"""Models of the viewer's requests to the master, and of the answers."""
 
 from __future__ import annotations
 
@@ -8,42 +8,41 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from master_server.api.history import Sample
-from master_server.core.robot_joints import RobotState
 from master_server.recording.replay import ReplayAnswer
 from master_server.viewer.sessions import Viewer
-from shared.messages import LatticeDescription, UnitRow
+from shared.messages import OPEN, LatticeDescription, RobotState, UnitRow
 
 NOT_RECORDED: dict[int, bytes] = {}
-"""Of `reports`, where a recording does not tell which unit reports which voxels."""
+"""Id for `reports`, if a recording does not name the unit of each voxel."""
 
 
 class ViewerMessage(BaseModel):
-    """Frozen; unknown names are refused: both ends are of one version."""
+    """Frozen; unknown names are refused, since both ends have the same version."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class BeginRequest(ViewerMessage):
-    """How the window is to be; answered by `BeginAnswer`."""
+    """Request for the configuration of the viewer; answered by `BeginAnswer`."""
 
     verb: Literal["begin"] = "begin"
 
 
 class ReadyRequest(ViewerMessage):
-    """The window is served at this port of loopback; answered by `ReadyAnswer`."""
+    """The viewer listens at this port of loopback; answered by `ReadyAnswer`."""
 
     verb: Literal["ready"] = "ready"
     port: int
 
 
-class LookRequest(ViewerMessage):
-    """What is wanted besides the map and the robot: it costs the master time or changes rarely. Answered by `Look`.
+class StateRequest(ViewerMessage):
+    """Request for the state, with the parts that are costly or change rarely. Answered by `ViewerState`.
 
     Attributes:
-        units: their rows, and how things stood after `since_ns`.
-        unseen: what nobody sees.
-        reports: which unit reports which voxels.
-        since_ns: the newest sample of the history that is known.
+        units: include the rows of the units, and the history after `since_ns`.
+        unseen: include the unseen blocks.
+        reports: include the voxels of each unit.
+        since_ns: the newest known sample of the history.
     """
 
     verb: Literal["look"] = "look"
@@ -54,7 +53,7 @@ class LookRequest(ViewerMessage):
 
 
 class ApiRequest(ViewerMessage):
-    """A request of the master's API, by somebody who looks; answered by `ApiAnswer`. `body` is JSON."""
+    """A request to the master's API on behalf of a browser; answered by `ApiAnswer`. `body` is JSON."""
 
     verb: Literal["ask"] = "ask"
     method: str
@@ -63,11 +62,11 @@ class ApiRequest(ViewerMessage):
     viewer: Viewer
 
 
-Request = Annotated[BeginRequest | ReadyRequest | LookRequest | ApiRequest, Field(discriminator="verb")]
+Request = Annotated[BeginRequest | ReadyRequest | StateRequest | ApiRequest, Field(discriminator="verb")]
 
 
 class BeginAnswer(ViewerMessage):
-    """The key that the master shows, and the actions of an operator on a unit: what a button says, and its address."""
+    """The key that the master sends, and an operator's actions on a unit: the text of each button and its address."""
 
     key: str
     actions: dict[str, str]
@@ -75,43 +74,43 @@ class BeginAnswer(ViewerMessage):
 
 
 class ReadyAnswer(ViewerMessage):
-    """The master knows."""
+    """Acknowledgement of `ReadyRequest`."""
 
 
 class ApiAnswer(ViewerMessage):
-    """What the API answers: its status and its body."""
+    """The status and the body of the API's answer."""
 
     status: int
     body: bytes
 
 
 class RefusedAnswer(ViewerMessage):
-    """Instead of any other answer: why there is none, in a sentence."""
+    """A refusal in place of any other answer, with its reason in a sentence."""
 
     refused: str
 
 
-class RobotStanding(ViewerMessage):
-    """Whether units can filter the robot, and why not in words."""
+class RobotStatus(ViewerMessage):
+    """The robot's state, and the reason in words if units cannot filter the robot."""
 
-    state: RobotState
+    state: Annotated[RobotState, OPEN]
     reason: str
 
 
 class SeenBits(ViewerMessage):
-    """What anybody looks through: one bit a block, in C order, packed."""
+    """The blocks that any unit sees: one bit per block, in C order, packed."""
 
     bits: bytes
     blocks: LatticeDescription
 
 
 class MapBits(ViewerMessage):
-    """The merged map: all that the picture of the obstacles is made of.
+    """The merged map: all data for drawing the obstacles.
 
     Attributes:
         keys: little-endian uint32 (N,), ascending.
         witnesses: uint8 (N,).
-        reports: keys of each live unit as in `keys`, by its id; None where nobody asked for them.
+        reports: keys of each live unit as in `keys`, by its id; None if not requested.
     """
 
     lattice: LatticeDescription
@@ -121,21 +120,21 @@ class MapBits(ViewerMessage):
 
     @property
     def count(self) -> int:
-        """How many voxels there are."""
+        """Number of voxels."""
         return len(self.witnesses)
 
     @property
-    def tells_who(self) -> bool:
-        """Whether it is known which unit reports a voxel, if there is any."""
+    def has_reports(self) -> bool:
+        """True if the unit of each voxel is known, or there are no voxels."""
         return not self.keys or self.reports != NOT_RECORDED
 
 
-class Look(ViewerMessage):
-    """The map and the robot at one time, and what else was wanted: None where it was not.
+class ViewerState(ViewerMessage):
+    """The map and the robot at one time, and the requested parts: None if not requested.
 
     Attributes:
         cell: the sha256 of the watched cell's document.
-        reasons: the first few, why the map is not complete; `reason_count` are all.
+        reasons: the first few reasons why the map is incomplete; `reason_count` counts all.
     """
 
     now_ns: int
@@ -145,7 +144,7 @@ class Look(ViewerMessage):
     reason_count: int
     oldest_view_age_s: float | None
     units_live: int
-    robot: RobotStanding
+    robot: RobotStatus
     joints: tuple[float, ...] | None
     units: tuple[UnitRow, ...] | None = None
     history: tuple[Sample, ...] = ()

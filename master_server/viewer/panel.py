@@ -20,17 +20,17 @@ from numpy.typing import NDArray
 
 from master_server.api.history import SAMPLES_MAX, Sample
 from master_server.recording.replay import ReplayAnswer
-from master_server.viewer.channel import Asker
-from master_server.viewer.messages import ApiAnswer, ApiRequest, Look
+from master_server.viewer.channel import MasterChannel
+from master_server.viewer.messages import ApiAnswer, ApiRequest, ViewerState
 from master_server.viewer.scene import (
     SHARED_COLOUR,
-    STATE_COLOURS,
     WITNESS_COLOURS,
     Colour,
     RangeLayer,
     UnseenLayer,
     VoxelLayer,
     Voxels,
+    state_colour,
     unit_colour,
 )
 from master_server.viewer.sessions import Viewer
@@ -92,7 +92,7 @@ COLOURINGS = BY_WITNESSES, BY_UNIT = "number of units", "unit"
 """What the colours of voxels may tell."""
 
 
-def status_html(told: Look) -> str:
+def status_html(told: ViewerState) -> str:
     """Whether the map is all there is, and why not."""
     replayed = told.replay
     lines = []
@@ -126,10 +126,10 @@ def table_html(rows: Sequence[UnitRow]) -> str:
     parts = [f"<tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr>"]
     for row in rows:
         health = row.health
-        state = row.state
+        state = html.escape(row.state)
         cells = (
             f"{row.id} · {html.escape(row.ip)}",
-            f'<span style="color:{_css(state)}">⬤</span> <b>{state}</b>',
+            f'<span style="color:{_css(row.state)}">⬤</span> <b>{state}</b>',
             "" if row.age_s is None else f"{row.age_s * 1000:.0f}",
             f"{row.fps:.1f}",
             f"{row.process_ms:.1f}",
@@ -189,7 +189,7 @@ def _progress_html(progress: Progress | None) -> str:
 
 
 def _css(state: str) -> str:
-    return "rgb({}, {}, {})".format(*STATE_COLOURS[state])
+    return "rgb({}, {}, {})".format(*state_colour(state))
 
 
 def _curve(points: list[tuple[int, float]], offset_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -220,7 +220,7 @@ class Panel:
         """When the newest sample of the history was taken that is shown."""
         return self._history[-1].at_ns if self._history else -1
 
-    def show(self, told: Look, wall_s: float) -> None:
+    def show(self, told: ViewerState, wall_s: float) -> None:
         """The newest, with units."""
         self._status.content = status_html(told)
         self._table.content = table_html(told.units or ())
@@ -297,14 +297,14 @@ class Player:
         self._wanted_s = float(self._position.value)
 
 
-class Person:
+class ClientPanel:
     """One who looks: what is theirs alone, and what they may do."""
 
     def __init__(
         self,
         client: viser.ClientHandle,
         viewer: Viewer,
-        asker: Asker,
+        asker: MasterChannel,
         actions: dict[str, str],
         is_replay: bool,
     ) -> None:
@@ -347,14 +347,14 @@ class Person:
         """Obstacles, in the colours that they want."""
         self._voxels.show(voxels, self.wants_by_unit)
 
-    def show(self, told: Look) -> None:
+    def show(self, told: ViewerState) -> None:
         """The newest, with units."""
         rows = told.units or ()
         units = {f"{row.id} · {row.ip}": row for row in rows}
         if units.keys() != self._units.keys():
             self._unit.options = tuple(units) or ("none",)
         self._units = units
-        self._legend.content = legend_html(self.wants_by_unit, [row.id for row in rows], told.map.tells_who)
+        self._legend.content = legend_html(self.wants_by_unit, [row.id for row in rows], told.map.has_reports)
         if self._wants_ranges.value:
             self._ranges.show(rows)
         else:
@@ -435,7 +435,7 @@ class Person:
 
     def _fetch(self, method: str, path: str, body: object = None) -> bytes:
         request = ApiRequest(method=method, path=path, body=body, viewer=self.viewer)
-        answer = self._asker.ask(request, ApiAnswer)
+        answer = self._asker.request(request, ApiAnswer)
         if answer.status >= 400:
             raise Refusal(answer.status, _detail(answer.body))
         return answer.body

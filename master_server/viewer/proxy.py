@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`/viewer/`: the page, the exchange of a link for a cookie, and the socket to the viewer's process.
+"""`/viewer/`: the page, the exchange of a link for a cookie, and the WebSocket to the viewer's process.
 
-The page is handed out by the master itself; of what browsers send, only what a person does in the window is passed
-on. Above all, a request for a tunnel to a host of the viewer's makers is not.
+The master itself serves the page. Of a browser's messages, only the actions of a user in the viewer are forwarded. In
+particular, a request for a tunnel to a host of viser's makers is not.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ VIEWERS_MAX = 16
 """A control room and some telephones; each costs the machine some per cent of a core."""
 
 MESSAGE_MAX_BYTES = 2**26
-"""Of the viewer's process: the whole cell at once, for one who has just come."""
+"""Bound of a message from the viewer's process: the whole cell at once, for a new browser."""
 
 PASSED = frozenset({"ViewerCameraMessage", "GuiUpdateMessage"})
-"""What is passed on of what browsers send: where they look from, and what somebody does with a control."""
+"""Forwarded messages of a browser: its camera, and the use of a control."""
 
 CHANGED = frozenset({"value"})
-"""What somebody changes of a control; its bounds and callbacks are not theirs."""
+"""Fields of a control that a browser may change; bounds and callbacks are excluded."""
 
 UNAVAILABLE = 1013
-"""What a WebSocket is closed with when there is nothing to look at."""
+"""Close code of a WebSocket if the viewer does not run."""
 
 LOGIN_SCRIPT = """
 const say = text => document.querySelector('output').textContent = text;
@@ -79,8 +79,8 @@ LOGIN_PAGE = f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>Cellwatch</title><link rel="icon" href="data:,">
 <style>{LOGIN_STYLE}</style>
 <h1>Cellwatch</h1>
-<p>Open the link that the master printed when it started, or enter the token of the operator (to look and change)
-or of the units (to look).</p>
+<p>Open the link that the master printed at its start, or enter the token of the operator (view and change)
+or of the units (view only).</p>
 <form><input type="password" aria-label="token" autocomplete="off" maxlength="{TOKEN_MAX_CHARS}" required>
 <button>Enter</button></form>
 <p><output></output></p>
@@ -103,7 +103,7 @@ LOGIN_HEADERS = COMMON_HEADERS | {
     "Content-Security-Policy": "default-src 'none'; connect-src 'self'; img-src data:; frame-ancestors 'none'; "
     f"form-action 'none'; base-uri 'none'; script-src {_hash(LOGIN_SCRIPT)}; style-src {_hash(LOGIN_STYLE)}",
 }
-# Everything is in the one page, which unpacks itself; the browser itself sees to it that nothing else is loaded.
+# The page is one file, which unpacks itself; the browser enforces that nothing else is loaded.
 PAGE_HEADERS = COMMON_HEADERS | {
     "Content-Security-Policy": "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'; connect-src 'self' data: "
     "blob:; frame-ancestors 'none'; form-action 'none'; base-uri 'none'",
@@ -112,7 +112,7 @@ PAGE_HEADERS = COMMON_HEADERS | {
 
 
 class LoginRequest(BaseModel):
-    """One of the two."""
+    """A code or a token; one of the two."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -121,16 +121,16 @@ class LoginRequest(BaseModel):
 
 
 class Gate:
-    """All that the routes below need: who may look, and what they look at."""
+    """The objects that the routes below need: access, and the viewer's process."""
 
     def __init__(self, host: ViewerHost, sessions: Sessions) -> None:
         self.host = host
         self.sessions = sessions
-        self.looking = 0
+        self.connected = 0
         self._page: bytes | None = None
 
     async def page(self) -> bytes:
-        """The one page that viser is, compressed."""
+        """Return viser's single page, compressed."""
         if self._page is None:
             self._page = await asyncio.to_thread(_read_page)
         return self._page
@@ -151,12 +151,12 @@ def _gate(connection: HTTPConnection) -> Gate:
 
 
 def cookie_name(connection: HTTPConnection) -> str:
-    """Browsers keep the cookies of all ports of a host together, and there may be a master at another one."""
+    """Return the cookie's name with the port: all ports of a host share their cookies, and each may be a master."""
     return f"cellwatch-viewer-{connection.scope['server'][1]}"
 
 
 def _viewer_of(connection: HTTPConnection) -> Viewer | None:
-    """What the caller may do; None without a cookie or a token where one is needed."""
+    """Return the caller's rights; None without a cookie or token if one is required."""
     cookie = connection.cookies.get(cookie_name(connection), "")
     viewer = _gate(connection).sessions.viewer(cookie, wall_ns())
     if viewer is None and "authorization" in connection.headers:
@@ -168,13 +168,13 @@ def _viewer_of(connection: HTTPConnection) -> Viewer | None:
 
 @router.get("/viewer")
 async def without_slash() -> Response:
-    """The page finds its socket by its own address."""
+    """Redirect to the address with a slash, since the page finds its socket relative to it."""
     return RedirectResponse(PAGE, 308)
 
 
 @router.get(PAGE)
 async def page(request: Request) -> Response:
-    """The window, or who is asked for a token."""
+    """Return the viewer, or the login page."""
     if _viewer_of(request) is None:
         return Response(LOGIN_PAGE, 401, LOGIN_HEADERS, "text/html; charset=utf-8")
     return Response(await _gate(request).page(), 200, PAGE_HEADERS, "text/html; charset=utf-8")
@@ -182,13 +182,13 @@ async def page(request: Request) -> Response:
 
 @router.get("/viewer/login")
 async def login_page() -> Response:
-    """Where links lead; the code in them stays in the browser until the page hands it in."""
+    """Return the target of links; their code stays in the browser until the page sends it."""
     return Response(LOGIN_PAGE, 200, LOGIN_HEADERS, "text/html; charset=utf-8")
 
 
 @router.post("/viewer/login", status_code=204)
 async def login(body: LoginRequest, request: Request) -> Response:
-    """A code or a token for a cookie."""
+    """Exchange a code or a token for a cookie."""
     _refuse_other_pages(request)
     gate, limits, ip, now_ns = _gate(request), limits_of(request), ip_of(request.scope), monotonic_ns()
     if body.token is not None:
@@ -218,19 +218,19 @@ async def login(body: LoginRequest, request: Request) -> Response:
 
 @router.post("/viewer/links", dependencies=OPERATOR_ONLY)
 async def make_link(request: Request) -> dict[str, str]:
-    """A link that lets whoever opens it first in as an operator, for some minutes."""
+    """Return a link that makes the first browser that opens it an operator; valid for some minutes."""
     return {"path": link_path(_gate(request).sessions)}
 
 
 def link_path(sessions: Sessions) -> str:
-    """What to put after the master's address to get into the window once."""
+    """Return the path behind the master's address that opens the viewer once."""
     return f"{PAGE}login#{sessions.make_code(monotonic_ns())}"
 
 
 @router.websocket("/viewer")
 @router.websocket(PAGE)
 async def window(websocket: WebSocket) -> None:
-    """What the page hears and says."""
+    """Forward messages between the page and the viewer's process."""
     gate = _gate(websocket)
     try:
         _refuse_other_pages(websocket)
@@ -238,39 +238,39 @@ async def window(websocket: WebSocket) -> None:
         if viewer is None:
             raise Refusal(401, "viewer: expected the cookie of a login, or a token")
         token_ended = access_of(websocket).end_of(SIGNED_WITH[viewer])
-        if gate.looking >= VIEWERS_MAX:
-            raise Refusal(503, f"viewer: {VIEWERS_MAX} look already")
+        if gate.connected >= VIEWERS_MAX:
+            raise Refusal(503, f"viewer: expected at most {VIEWERS_MAX} browsers, so many are connected; close one")
         await gate.host.open()
     except Refusal as refusal:
         log_refusal(websocket.scope, refusal)
         await websocket.send_denial_response(refused(refusal))
         return
     fields = {"event": "viewer", "ip": ip_of(websocket.scope)}
-    gate.looking += 1
+    gate.connected += 1
     try:
-        logger.info("viewer: %s looks as %s (%d in all)", fields["ip"], viewer.value, gate.looking, extra=fields)
-        await _pass_on(websocket, gate.host, viewer, token_ended)
+        logger.info("viewer: %s connected as %s (%d in all)", fields["ip"], viewer.value, gate.connected, extra=fields)
+        await _forward(websocket, gate.host, viewer, token_ended)
     except (OSError, InvalidHandshake) as error:
         logger.warning("viewer: its process does not answer: %s", error, extra=fields)
         await websocket.close(UNAVAILABLE)
     finally:
-        gate.looking -= 1
-        logger.info("viewer: %s is gone", fields["ip"], extra=fields)
+        gate.connected -= 1
+        logger.info("viewer: %s disconnected", fields["ip"], extra=fields)
 
 
 def _refuse_other_pages(connection: HTTPConnection) -> None:
-    """No page but our own may act for whoever looks at it."""
+    """Refuse requests of other pages: only our own may act for its user."""
     origin = connection.headers.get("origin")
     if origin is not None and urlsplit(origin).netloc != connection.headers.get("host"):
         raise Refusal(403, "viewer: expected a request of the master's own page, got one of another")
 
 
-async def _pass_on(websocket: WebSocket, host: ViewerHost, viewer: Viewer, token_ended: asyncio.Event) -> None:
+async def _forward(websocket: WebSocket, host: ViewerHost, viewer: Viewer, token_ended: asyncio.Event) -> None:
     async with connect(
         f"ws://127.0.0.1:{host.port}/",
         subprotocols=websocket.scope["subprotocols"] or None,
         additional_headers={"Authorization": f"Bearer {host.key}", "Cellwatch-Viewer": viewer.value},
-        # One who is slow holds back what comes, not what is kept here: viser then sends only the newest.
+        # A slow browser blocks the process, not a buffer here: viser then sends only the newest.
         max_queue=1,
         max_size=MESSAGE_MAX_BYTES,
         compression=None,
@@ -288,7 +288,7 @@ async def _up(websocket: WebSocket, inner: ClientConnection) -> None:
         if is_passed(data):
             await inner.send(data)
         else:
-            logger.debug("viewer: something that no person does was not passed on")
+            logger.debug("viewer: a message that is no action of a user was dropped")
 
 
 async def _down(websocket: WebSocket, inner: ClientConnection) -> None:
@@ -299,7 +299,7 @@ async def _down(websocket: WebSocket, inner: ClientConnection) -> None:
 
 
 def is_passed(data: bytes) -> bool:
-    """Whether a message of a browser may reach the viewer's process."""
+    """Return True if a message of a browser may reach the viewer's process."""
     try:
         message = msgpack.unpackb(data)
     except (ValueError, TypeError, RecursionError, msgpack.UnpackException):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cell, drawn: box, CAD, robot, cameras, obstacles and what nobody sees."""
+"""Draw the cell: box, CAD, robot, cameras, obstacles and unseen blocks."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ UNSEEN_COLOUR = (110, 80, 150)
 UNSEEN_OPACITY = 0.16
 
 WITNESS_COLOURS: tuple[Colour, ...] = ((240, 110, 28), (214, 46, 33), (150, 13, 59))
-"""Of voxels that one unit reports, two, and more: orange, red and crimson."""
+"""Colours of voxels that one unit reports, two, and more: orange, red and crimson."""
 
 UNIT_COLOURS: tuple[Colour, ...] = (
     (240, 110, 28),
@@ -45,24 +45,24 @@ UNIT_COLOURS: tuple[Colour, ...] = (
     (140, 80, 40),
     (125, 185, 40),
 )
-"""Of voxels that one unit alone reports, by its id; they begin anew after the last."""
+"""Colours of voxels that only one unit reports, by its id; repeated after the last."""
 
 SHARED_COLOUR: Colour = (85, 85, 85)
-"""Of voxels that several units report, where colours tell the unit; and where nobody knows which one it was."""
+"""Colour of voxels that several units report, if colours show the unit; also if the unit is unknown."""
 
 VOXEL_SHARE = 0.92
-"""Of a voxel's edge that is drawn, so that one can tell them apart."""
+"""Drawn part of a voxel's edge; the gap keeps voxels apart."""
 
 VOXELS_MAX = 20_000
-"""Beyond, every second or third is drawn: browsers of control rooms draw no more in time."""
+"""Beyond, only every second or third is drawn: browsers of control rooms draw no more in time."""
 
 FRUSTUM_M = 0.18
-"""How far before a camera the base of its pyramid is drawn."""
+"""Distance of a camera's pyramid base from the camera."""
 
 FRUSTUM_LINE_M, RANGE_LINE_PX = 0.015, 1.5
 
 RANGE_SHADE = 0.55
-"""Of the colour of a camera's state, for the lines that show how far it looks; the rest is white."""
+"""Share of a camera's state colour in the lines of its range; the rest is white."""
 
 BOX_EDGES = np.array(
     [(a, b) for a in range(8) for b in range(8) if a < b and bin(a ^ b).count("1") == 1], dtype=np.int64
@@ -73,32 +73,32 @@ QUAD = np.array([(0, 1, 2), (0, 2, 3)], np.uint32)
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
 
 VIEW_FROM = np.array([0.98, 0.6, 0.66])
-"""In diagonals of the box, from its middle."""
+"""Position of the initial view, in diagonals of the box, from its middle."""
 
 VIEW_FOV_RAD = 0.8
-"""Of who looks, vertically."""
+"""Vertical field of view of the browser's camera."""
 
 Points: TypeAlias = NDArray[np.float32]
 
 
 PYRAMID = np.array([(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)])
-"""Edges of a view: from the eye, which comes first, to the picture's corners, and between these."""
+"""Edges of a view: from the camera's centre, which is corner 0, to the image's corners, and between these."""
 
 
 def linear(colours: Sequence[Colour]) -> NDArray[np.uint8]:
-    """Colours (N, 3) of a screen as viser wants those of many bodies: in proportion to light."""
+    """Convert screen colours (N, 3) to linear light, which viser expects for batches of meshes."""
     share = np.asarray(colours, np.float64) / 255.0
     light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return np.rint(light * 255.0).astype(np.uint8)
 
 
 def unit_colour(unit_id: int) -> Colour:
-    """Of what one unit alone reports."""
+    """Return the colour of voxels that only this unit reports."""
     return UNIT_COLOURS[(unit_id - 1) % len(UNIT_COLOURS)]
 
 
 def owners(keys: NDArray[np.uint32], reports: Mapping[int, NDArray[np.uint32]]) -> NDArray[np.int64]:
-    """The id of the one unit that reports each of the `keys` (N,), 0 where none or several do."""
+    """Return the id of the only unit that reports each of the `keys` (N,); 0 if none or several do."""
     found = np.zeros(len(keys), np.int64)
     counts = np.zeros(len(keys), np.int64)
     for unit_id, reported in reports.items():
@@ -109,7 +109,7 @@ def owners(keys: NDArray[np.uint32], reports: Mapping[int, NDArray[np.uint32]]) 
 
 
 def view_edges(intrinsics: Intrinsics, depth_m: float) -> Points:
-    """What a camera looks through down to `depth_m`, as line segments (8, 2, 3) in its own frame."""
+    """Return a camera's view down to `depth_m`, as line segments (8, 2, 3) in its own frame."""
     right, bottom = intrinsics.width - 0.5, intrinsics.height - 0.5
     corners = np.array([(-0.5, -0.5), (right, -0.5), (right, bottom), (-0.5, bottom)])
     rays = (corners - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy)
@@ -118,12 +118,12 @@ def view_edges(intrinsics: Intrinsics, depth_m: float) -> Points:
 
 
 def wxyz_of(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation of a transform (4, 4) as viser has it."""
+    """Return the rotation of a transform (4, 4) as viser's quaternion."""
     return np.asarray(SO3.from_matrix(np.asarray(T, np.float64)[:3, :3]).wxyz)
 
 
 def cube(edge_m: float) -> tuple[Points, NDArray[np.uint32]]:
-    """Vertices (8, 3) and faces (12, 3) about the origin."""
+    """Return vertices (8, 3) and faces (12, 3) about the origin."""
     corners = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32) - 0.5
     faces = [
         *((0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)),
@@ -133,7 +133,7 @@ def cube(edge_m: float) -> tuple[Points, NDArray[np.uint32]]:
 
 
 def surface(inside: NDArray[np.bool_], lattice: Lattice) -> tuple[Points, NDArray[np.uint32]]:
-    """The faces between blocks that are `inside` (the lattice's shape) and all else, as (V, 3) and (F, 3)."""
+    """Return the faces between blocks `inside` (the lattice's shape) and all other blocks, as (V, 3) and (F, 3)."""
     padded = np.pad(inside, 1)
     quads = []
     for axis in range(3):
@@ -156,13 +156,13 @@ def surface(inside: NDArray[np.bool_], lattice: Lattice) -> tuple[Points, NDArra
 def view_of(
     box_min_m: NDArray[np.float64], box_max_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where one first stands and what one looks at: from a corner and above, so that all of the box is seen."""
+    """Return the initial camera position and its target: from a corner and above, with the whole box in view."""
     middle, size = (box_min_m + box_max_m) / 2.0, box_max_m - box_min_m
     return middle + VIEW_FROM * float(np.linalg.norm(size)), middle - (0.0, 0.0, 0.05 * size[2])
 
 
 class Scene:
-    """What all who look see alike; one thread at a time."""
+    """The objects that all browsers see alike; used by one thread at a time."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
@@ -170,7 +170,7 @@ class Scene:
         self._parts: list[Any] = []
         self._links: list[Any] = []
         self._cameras: dict[int, tuple[Any, ...]] = {}
-        self._told: dict[int, tuple[object, ...]] = {}
+        self._drawn_rows: dict[int, tuple[object, ...]] = {}
         self._joints: tuple[float, ...] | None = None
         server.scene.set_up_direction("+z")
 
@@ -214,7 +214,7 @@ class Scene:
         self._server.initial_camera.fov = VIEW_FOV_RAD
 
     def set_joints(self, positions: tuple[float, ...] | None) -> None:
-        """The robot stands so; without positions it is not drawn."""
+        """Set the robot's joints; without positions the robot is hidden."""
         if self._cell is None or self._cell.robot is None or positions == self._joints:
             return
         self._joints = positions
@@ -230,16 +230,16 @@ class Scene:
                 link.visible = True
 
     def set_units(self, rows: Sequence[UnitRow]) -> None:
-        """A pyramid a unit whose pose is known, in the colour of its state."""
+        """Draw a pyramid for each unit with a known pose, in the colour of its state."""
         posed = {row.id: row for row in rows if row.T_world_camera is not None}
         for unit_id in self._cameras.keys() - posed.keys():
             for part in self._cameras.pop(unit_id):
                 part.remove()
-            self._told.pop(unit_id, None)
+            self._drawn_rows.pop(unit_id, None)
         for unit_id, row in posed.items():
-            told = (row.state, row.T_world_camera, row.intrinsics)
-            if self._told.get(unit_id) != told:
-                self._told[unit_id] = told
+            shape = (row.state, row.T_world_camera, row.intrinsics)
+            if self._drawn_rows.get(unit_id) != shape:
+                self._drawn_rows[unit_id] = shape
                 self._draw_camera(unit_id, row)
 
     def _body(self, name: str, body: PlacedMesh, colour: Colour) -> Any:
@@ -264,13 +264,13 @@ class Scene:
             f"/labels/{unit_id}", text, position=pose[:3, 3] + (0.0, 0.0, 0.15), anchor="bottom-center"
         )
         if row.intrinsics is None:
-            # A recording of before units' intrinsics were kept: where it is, and not what it looks at.
+            # A recording from before intrinsics were stored: the position is known, the view is not.
             self._cameras[unit_id] = (label,)
             return
         pyramid = self._server.scene.add_line_segments(
             f"/cameras/{unit_id}",
             view_edges(row.intrinsics, FRUSTUM_M),
-            STATE_COLOURS[state],
+            state_colour(state),
             thickness=FRUSTUM_LINE_M,
             wxyz=wxyz_of(pose),
             position=pose[:3, 3],
@@ -280,7 +280,7 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """Obstacles at one time, as they are drawn: at most `VOXELS_MAX` of them."""
+    """Obstacles at one time, as drawn: at most `VOXELS_MAX` of them."""
 
     size_m: float
     centres: Points
@@ -295,14 +295,14 @@ class Voxels:
         witnesses: NDArray[np.uint8],
         reports: Mapping[int, NDArray[np.uint32]],
     ) -> Voxels:
-        """Those of a map; `reports` are the units' own, by their id."""
+        """Return the voxels of a map; `reports` are the units' own keys, by their id."""
         stride = -(-max(len(keys), 1) // VOXELS_MAX)
         keys = keys[::stride]
         centres = lattice.centres(lattice.indices(keys)).astype(np.float32)
         return cls(lattice.voxel_size_m, centres, witnesses[::stride], owners(keys, reports))
 
     def colours(self, by_unit: bool) -> NDArray[np.uint8]:
-        """One (N, 3) each, as viser wants them: by the number of units that report it, or by the one that does."""
+        """Return (N, 3) colours for viser: by the number of units that report a voxel, or by the single unit."""
         if not by_unit:
             return linear(WITNESS_COLOURS)[np.clip(self.witnesses.astype(np.int64) - 1, 0, len(WITNESS_COLOURS) - 1)]
         found = np.tile(linear([SHARED_COLOUR]), (len(self.owners), 1))
@@ -312,7 +312,7 @@ class Voxels:
 
 
 class VoxelLayer:
-    """Obstacles, for one who wants them in colours of their own choice."""
+    """Obstacles in the colours that one browser has chosen."""
 
     def __init__(self, client: viser.ClientHandle) -> None:
         self._client = client
@@ -348,7 +348,7 @@ class VoxelLayer:
 
 
 class RangeLayer:
-    """How far each live camera looks now, for one who wants to see it."""
+    """The present range of each live camera, for a browser that has switched it on."""
 
     def __init__(self, client: viser.ClientHandle) -> None:
         self._client = client
@@ -356,7 +356,7 @@ class RangeLayer:
         self._drawn: dict[int, tuple[object, ...]] = {}
 
     def show(self, rows: Sequence[UnitRow]) -> None:
-        """Draw it: what each camera looks through, down to the farthest block that it sees."""
+        """Draw the view of each camera, down to the farthest block that it sees."""
         known = {row.id: _range_of(row) for row in rows if row.state == "live"}
         shown = {unit_id: drawn for unit_id, drawn in known.items() if drawn is not None}
         for unit_id in self._parts.keys() - shown.keys():
@@ -369,7 +369,7 @@ class RangeLayer:
             range_m, T_world_camera, intrinsics = drawn
             pose = np.asarray(T_world_camera)
             shade = RANGE_SHADE * np.array(STATE_COLOURS["live"]) + (1.0 - RANGE_SHADE) * 255.0
-            # One of the same name takes the place of the one before.
+            # A node of the same name replaces the old one.
             self._parts[unit_id] = self._client.scene.add_line_segments(
                 f"/ranges/{unit_id}",
                 view_edges(intrinsics, range_m),
@@ -381,19 +381,24 @@ class RangeLayer:
             )
 
     def hide(self) -> None:
-        """Draw it no more."""
+        """Hide the ranges."""
         self.show([])
 
 
+def state_colour(state: str) -> Colour:
+    """The colour of a unit's state; a state of a later minor is not live, and has the colour of a blind one."""
+    return STATE_COLOURS.get(state, STATE_COLOURS["blind"])
+
+
 def _range_of(row: UnitRow) -> tuple[float, Matrix, Intrinsics] | None:
-    """How far a camera looks, from where and how; None while any of it is not known."""
+    """Return a camera's range, pose and intrinsics; None while any of them is unknown."""
     if row.range_m is None or row.T_world_camera is None or row.intrinsics is None:
         return None
     return row.range_m, row.T_world_camera, row.intrinsics
 
 
 class UnseenLayer:
-    """What no live unit looks through, for one who wants to see it."""
+    """The unseen blocks, for a browser that has switched them on."""
 
     def __init__(self, client: viser.ClientHandle) -> None:
         self._client = client
@@ -401,7 +406,7 @@ class UnseenLayer:
         self._drawn = b""
 
     def show(self, seen_bits: bytes, blocks: Lattice) -> None:
-        """Draw it; `seen_bits` are one bit a block."""
+        """Draw the blocks; `seen_bits` has one bit per block."""
         if seen_bits == self._drawn:
             return
         self._drawn = seen_bits
@@ -422,12 +427,12 @@ class UnseenLayer:
             )
 
     def hide(self) -> None:
-        """Draw it no more."""
+        """Hide the blocks."""
         self._drawn = b""
         self._take_out()
 
     def _take_out(self) -> None:
-        """Take out what is drawn."""
+        """Remove the drawn node."""
         if self._part is not None:
             self._part.remove()
             self._part = None

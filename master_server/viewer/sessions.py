@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who may look, and who may change something: links that work once, and cookies.
+"""Access to the viewer: links that work once, and cookies.
 
-A browser sends no `Authorization` header of its own accord, and a token in an address ends up in histories and logs.
-So a link carries a code that works once, behind the `#` that browsers keep to themselves; the page hands it in and is
-given a cookie. The cookie is signed with the token that it stands for: it outlives a restart of the master, and is
-void as soon as that token is replaced, as are links that were not opened yet.
+A browser sends no `Authorization` header by itself, and a token in an address ends up in histories and logs. So a link
+carries a code that works once, behind the `#`, which browsers do not send. The page sends the code and receives a
+cookie. The cookie is signed with the token that it stands for. It outlives a restart of the master, and is void as soon
+as that token is replaced, as are links that were not opened yet.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from shared.clock import NS_PER_S
 from shared.errors import Refusal
 
 LINK_S = 600
-"""A link is opened by whoever asked for it, at once; what is left in a terminal or a log is worth nothing."""
+"""A link is meant to be opened at once; one that is left in a terminal or a log has expired."""
 
 LINKS_MAX = 16
 """Links that were made and not opened; beyond, the oldest is void."""
@@ -27,14 +27,14 @@ LINKS_MAX = 16
 CODE_BYTES = 32
 
 SESSION_S = 12 * 3600
-"""A long shift; then the operator asks for a new link."""
+"""A long shift; after it the operator needs a new link."""
 
 COOKIE_MAX_CHARS = 256
-"""Of a cookie, about three times what ours take."""
+"""Largest cookie, about three times the size of ours."""
 
 
 class Viewer(str, Enum):
-    """What somebody in front of the window may do."""
+    """The rights of a user of the viewer."""
 
     READER = "reader"
     OPERATOR = "operator"
@@ -44,19 +44,19 @@ SIGNED_WITH = {Viewer.READER: Role.UNIT, Viewer.OPERATOR: Role.OPERATOR}
 
 
 def viewer_of(role: Role) -> Viewer:
-    """What the holder of a token may do: with the units' token, look."""
+    """Return the rights of a token's holder: the units' token may only view."""
     return Viewer.OPERATOR if role is Role.OPERATOR else Viewer.READER
 
 
 class Sessions:
-    """Links of one master and the cookies that they are exchanged for."""
+    """The links of one master and the cookies that they are exchanged for."""
 
     def __init__(self, access: Access) -> None:
         self._access = access
         self._links: dict[str, int] = {}
 
     def make_code(self, now_ns: int) -> str:
-        """The code of a link, with which somebody may once become an operator."""
+        """Return the code of a link, which makes its opener an operator once."""
         while len(self._links) >= LINKS_MAX:
             del self._links[next(iter(self._links))]
         code = secrets.token_urlsafe(CODE_BYTES)
@@ -64,10 +64,10 @@ class Sessions:
         return code
 
     def redeem(self, code: str, now_ns: int) -> Viewer:
-        """Who opened the link with this code, which is worth nothing from now on.
+        """Return the rights of the link with this code, and void the code.
 
         Raises:
-            Refusal: 401, there is no such link, it was opened before or is too old.
+            Refusal: 401, there is no such link, it was used before, or it has expired.
         """
         expires_at_ns = self._links.pop(self._digest(code), None)
         if expires_at_ns is None or expires_at_ns <= now_ns:
@@ -75,13 +75,13 @@ class Sessions:
         return Viewer.OPERATOR
 
     def cookie(self, viewer: Viewer, wall_ns: int) -> str:
-        """What a browser is given to keep for `SESSION_S`."""
-        # By the wall clock: the monotonic one begins anew with the machine, and a cookie may outlive that.
+        """Return the value of a cookie that is valid for `SESSION_S`."""
+        # By the wall clock: the monotonic one restarts with the machine, and a cookie may outlive that.
         expires_s = wall_ns // NS_PER_S + SESSION_S
         return f"{viewer.value}.{expires_s}.{self._signature(viewer, expires_s)}"
 
     def viewer(self, cookie: str, wall_ns: int) -> Viewer | None:
-        """Whose cookie it is; None for one that is not ours, or not any more."""
+        """Return the rights of a cookie; None for a forged or expired one."""
         parts = cookie[:COOKIE_MAX_CHARS].split(".")
         if len(parts) != 3 or not cookie.isascii():
             return None
@@ -99,5 +99,5 @@ class Sessions:
         return hmac.new(key, f"cellwatch viewer {viewer.value} {expires_s}".encode(), hashlib.sha256).hexdigest()
 
     def _digest(self, code: str) -> str:
-        """By which a code is found, so that how long it takes tells nothing of it, and only while the token holds."""
+        """Return the key under which a code is stored: its timing reveals nothing, and it changes with the token."""
         return hmac.new(self._access.operator_token, code.encode("utf-8", "surrogatepass"), hashlib.sha256).hexdigest()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one look at the master tells: as little work for the master as may be, arrays as they lie in memory."""
+"""The master's state for one refresh of the viewer: with little work for the master, arrays as they are in memory."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 from master_server.api.history import History
 from master_server.core import Readable
 from master_server.recording.replay import Replay
-from master_server.viewer.messages import Look, LookRequest, MapBits, RobotStanding, SeenBits
+from master_server.viewer.messages import MapBits, RobotStatus, SeenBits, StateRequest, ViewerState
 from shared.messages import LatticeDescription
 
 REASONS_MAX = 8
-"""Why the map is not complete: what fits beside it; one for each of 64 units does not."""
+"""Reasons in the panel: as many as fit beside the map; one for each of 64 units would not."""
 
 
-def look(master: Readable, history: History, wanted: LookRequest, now_ns: int) -> Look:
-    """The map and the robot, and what else is wanted.
+def viewer_state(master: Readable, history: History, wanted: StateRequest, now_ns: int) -> ViewerState:
+    """Return the map and the robot, and the requested parts.
 
     Raises:
         Refusal: 500, a recording is damaged here.
@@ -27,7 +27,7 @@ def look(master: Readable, history: History, wanted: LookRequest, now_ns: int) -
     if wanted.unseen:
         bits = np.packbits(master.seen_by(now_ns) > 0).tobytes()
         seen = SeenBits(bits=bits, blocks=LatticeDescription.of(master.blocks_at(now_ns)))
-    return Look(
+    return ViewerState(
         now_ns=now_ns,
         cell=master.published.reference.sha256,
         map=MapBits(
@@ -40,7 +40,7 @@ def look(master: Readable, history: History, wanted: LookRequest, now_ns: int) -
         reason_count=len(view.reasons),
         oldest_view_age_s=view.oldest_view_age_s,
         units_live=view.units_live,
-        robot=RobotStanding(state=robot.state, reason=robot.reason),
+        robot=RobotStatus(state=robot.state, reason=robot.reason),
         joints=robot.joints[-1].positions if robot.joints else None,
         units=tuple(master.units(now_ns)) if wanted.units else None,
         history=tuple(history.since(wanted.since_ns)) if wanted.units else (),

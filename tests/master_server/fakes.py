@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small cells, and units that are nothing but the messages they send."""
+"""Small cells, and fake units that only send messages."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def cell(with_robot: bool = False) -> Cell:
 
 
 def master(with_robot: bool = False, **settings: Any) -> Master:
-    """A master of that cell."""
+    """Return a master of that cell."""
     return Master(cell(with_robot), Settings(**settings))
 
 
@@ -73,7 +73,7 @@ class FakeUnit:
     versions: Versions = field(init=False)
 
     def introduction(self, sent_ns: int, contract: int = CONTRACT_VERSION) -> InitializeRequest:
-        """Who it is."""
+        """Return its registration request."""
         return InitializeRequest(
             contract=contract,
             contract_minor=CONTRACT_MINOR,
@@ -85,7 +85,7 @@ class FakeUnit:
         )
 
     def initialize(self, now_ns: int = START_NS, pose: Matrix | None = AT_ORIGIN) -> InitializeAnswer:
-        """Register; a unit that knows its pose tells it when the master does not."""
+        """Register; set the pose if the unit knows it and the master does not."""
         sent_ns = now_ns - self.delay_ns - self.offset_ns
         request = self.introduction(sent_ns)
         answer = self.master.initialize(request, self.ip, now_ns)
@@ -104,7 +104,7 @@ class FakeUnit:
         age_ns: int = 30 * MS,
         **changes: Any,
     ) -> UpdateRequest:
-        """The next update, as it arrives at `now_ns` with a frame captured `age_ns` before."""
+        """Return the next update, which arrives at `now_ns` with a frame captured `age_ns` before."""
         self.sequence += 1
         fields: dict[str, Any] = {
             "id": self.initialized.id,
@@ -122,7 +122,7 @@ class FakeUnit:
         return UpdateRequest(**{**fields, **changes})
 
     def update(self, now_ns: int, keys: Iterable[int] = (), **changes: Any) -> UpdateAnswer:
-        """Send the next update, and follow what the answer says of versions."""
+        """Send the next update, and adopt the versions of the answer."""
         request = self.request(now_ns, keys, **changes)
         answer = self.master.update(request, self.ip, now_ns)
         self.exchange = Exchange(request.sent_at_ns, now_ns, now_ns, now_ns + self.delay_ns - self.offset_ns)
@@ -133,14 +133,14 @@ class FakeUnit:
 
 
 def joined(master: Master, number: int = 1, now_ns: int = START_NS) -> FakeUnit:
-    """Unit `number`, registered with its pose."""
+    """Return unit `number`, registered with its pose."""
     unit = FakeUnit(master, ip=f"10.0.0.{number}", serial=f"S{number}")
     unit.initialize(now_ns)
     return unit
 
 
 def sees_all(master: Master) -> SeenReport:
-    """A report of a unit that looks through every block."""
+    """Return the report of a unit that sees every block."""
     blocks = master.coverage.blocks
     report = pack_seen(np.ones(blocks.shape, dtype=bool), blocks.voxel_size_m)
     assert report is not None

@@ -51,7 +51,7 @@ class Desk:
             return await client.request(method, path, headers=headers, **more)
 
     async def register(self, ip: str = "10.0.0.1", serial: str = "A") -> FakeUnit:
-        """A unit that has its slot and has told its pose, all over HTTP."""
+        """Register a unit and set its pose, all over HTTP."""
         unit = FakeUnit(self.app.services.master, ip, serial)
         sent_ns = monotonic_ns()
         request = unit.introduction(sent_ns)
@@ -117,7 +117,7 @@ async def test_unseen_blocks_on_request(desk: Desk) -> None:
     assert (await desk.call("GET", "/voxels")).json()["unseen"] is None
 
 
-async def test_how_much_of_the_cell_is_seen(desk: Desk) -> None:
+async def test_coverage_of_the_cell(desk: Desk) -> None:
     first, second = await desk.register("10.0.0.1", "A"), await desk.register("10.0.0.2", "B")
     await desk.update(first, seen=sees_all(first.master))
     half = np.zeros((10, 20, 5), bool)
@@ -135,7 +135,7 @@ async def test_how_much_of_the_cell_is_seen(desk: Desk) -> None:
     assert np.array_equal(np.repeat(blocks["counts"], blocks["runs"]).reshape(blocks["shape"]), 1 + half)
 
 
-async def test_what_health_tells_everyone(desk: Desk) -> None:
+async def test_health_without_a_token(desk: Desk) -> None:
     await desk.register("10.0.0.1", "A")
     await desk.update(await desk.register("10.0.0.2", "B"))
     found = (await desk.call("GET", "/healthz", None)).json()
@@ -143,7 +143,7 @@ async def test_what_health_tells_everyone(desk: Desk) -> None:
     assert found == {"status": "ok", "version": VERSION, "units": 2, "live": 1, "storage": "ok"}
 
 
-async def test_what_monitoring_reads(desk: Desk) -> None:
+async def test_metrics_for_monitoring(desk: Desk) -> None:
     unit = await desk.register()
     for _ in range(3):
         assert (await desk.update(unit, 1, 2)).status_code == 200
@@ -174,13 +174,13 @@ async def test_units_have_a_row_each(desk: Desk) -> None:
     assert rows[1]["health"]["valid_share"] == GOOD.valid_share
 
 
-async def test_headers_do_not_change_who_one_is(desk: Desk) -> None:
+async def test_headers_do_not_change_the_callers_address(desk: Desk) -> None:
     unit = await desk.register()
     body = encode_update(unit.request(monotonic_ns()))
     forged = {**MSGPACK, "X-Forwarded-For": "10.0.0.1", "Forwarded": "for=10.0.0.1"}
     response = await desk.call("POST", "/update", UNIT, "10.0.0.66", content=body, headers=forged)
     assert response.status_code == 403
-    assert "not the unit of 10.0.0.66" in response.json()["detail"]
+    assert "another IP than 10.0.0.66" in response.json()["detail"]
 
 
 async def test_an_ipv4_address_is_the_same_on_a_socket_for_both(desk: Desk) -> None:
@@ -213,7 +213,7 @@ DOORS = [
     ("GET", "/units/1/images/depth", 401, 404, 404),
     ("PUT", "/units/1/images/depth?command=1", 401, 404, 403),
     ("DELETE", "/units/1", 401, 403, 404),
-    # This application has nowhere to write to.
+    # This application has no folder for recordings.
     ("GET", "/recording", 401, 409, 409),
     ("POST", "/recording", 401, 403, 409),
     ("DELETE", "/recording", 401, 403, 409),
@@ -235,7 +235,7 @@ async def test_tokens(desk: Desk, method: str, path: str, nobody: int, unit: int
             assert OPERATOR not in detail
 
 
-async def test_every_route_but_health_has_its_door_tested(desk: Desk) -> None:
+async def test_every_route_but_health_is_in_the_token_test(desk: Desk) -> None:
     names = {"/1": "/{unit_id}", "0" * 64: "{sha256}", "/depth": "/{kind}", "?command=1": ""}
     listed = set()
     for method, path, *_ in DOORS:
@@ -247,7 +247,7 @@ async def test_every_route_but_health_has_its_door_tested(desk: Desk) -> None:
     assert served <= listed
 
 
-async def test_recording_is_switched_while_it_runs(tmp_path: Path) -> None:
+async def test_recording_starts_and_stops_at_run_time(tmp_path: Path) -> None:
     watched = master()
     recorder = Recorder(watched, RecordingConfig(free_bytes_min=0), tmp_path)
     desk = Desk(make_app(watched, Access(UNIT.encode(), OPERATOR.encode()), recorder))
@@ -267,7 +267,7 @@ async def test_public_reads() -> None:
     assert (await desk.call("PUT", "/settings", None, json={})).status_code == 401
 
 
-async def test_a_unit_tells_its_own_pose_and_an_operator_any(desk: Desk) -> None:
+async def test_a_unit_sets_its_own_pose_and_an_operator_any(desk: Desk) -> None:
     unit = await desk.register("10.0.0.1")
     body = {"T_world_camera": AT_ORIGIN}
     path = f"/units/{unit.initialized.id}/pose"
@@ -338,7 +338,7 @@ async def test_nothing_is_read_of_a_body_without_a_token(desk: Desk, token: str 
     assert read == []
 
 
-async def test_what_is_no_json_is_said_of_the_body(desk: Desk) -> None:
+async def test_invalid_json_names_the_body(desk: Desk) -> None:
     response = await desk.call("PUT", "/settings", content=b"{", headers={"Content-Type": "application/json"})
     assert response.status_code == 422
     assert response.json()["detail"].startswith("body: expected JSON")
@@ -430,7 +430,7 @@ async def test_a_body_beyond_its_bound_is_refused(desk: Desk) -> None:
     assert (await desk.update(unit, 1)).status_code == 200
 
 
-async def test_a_body_that_does_not_come_is_not_waited_for(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_missing_body_times_out(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(common, "BODY_TIMEOUT_S", 0.05)
     gate = asyncio.Event()
 

@@ -8,7 +8,7 @@ import pytest
 from master_server.config import MasterConfig
 
 
-def test_state_lies_where_the_service_manager_wants_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_state_folder_is_that_of_the_service_manager(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
     assert MasterConfig(cell=Path("cell.yaml")).state_dir == tmp_path / "cellwatch" / "master"
@@ -16,5 +16,5 @@ def test_state_lies_where_the_service_manager_wants_it(monkeypatch: pytest.Monke
     assert MasterConfig(cell=Path("cell.yaml")).state_dir == Path("/var/lib/a")
 
 
-def test_reads_are_not_public_by_themselves() -> None:
+def test_reads_are_not_public_by_default() -> None:
     assert not MasterConfig(cell=Path("cell.yaml")).public_reads

@@ -19,14 +19,14 @@ Configure = Callable[[LogFormat], io.StringIO]
 
 @pytest.fixture
 def configured(monkeypatch: pytest.MonkeyPatch) -> Iterator[Configure]:
-    """Configures the log for one test, and hands out what is written to it."""
+    """Yield a function that configures the log for one test and returns the stream that it writes to."""
     root = logging.getLogger()
     handlers, level = root.handlers[:], root.level
 
     def begin(form: LogFormat) -> io.StringIO:
         written = io.StringIO()
         monkeypatch.setattr("sys.stderr", written)
-        # Pytest's own, which would otherwise have taken the log over.
+        # Remove pytest's own handlers: logging would count as already set up.
         root.handlers.clear()
         configure("INFO", form)
         return written
@@ -40,7 +40,7 @@ def parsed(written: io.StringIO) -> list[dict[str, Any]]:
     return [json.loads(line) for line in written.getvalue().splitlines()]
 
 
-def test_a_line_of_json_tells_who_and_what(configured: Configure) -> None:
+def test_a_line_of_json_has_source_and_event(configured: Configure) -> None:
     written = configured("json")
     one = master()
     unit = joined(one)
@@ -99,7 +99,7 @@ def test_no_token_is_written(configured: Configure, form: LogFormat, message: st
         parsed(written)
 
 
-def test_what_is_no_token_stays() -> None:
+def test_other_text_is_not_redacted() -> None:
     line = "no bearer token: expected the header 'Authorization: Bearer <token>'; made the unit token in /var/x"
     assert redacted(line) == line
 
@@ -119,7 +119,7 @@ def record(event: str | None, ip: str = "10.0.0.1", text: str = "%s") -> logging
     return found
 
 
-def test_what_repeats_is_told_a_few_times_and_then_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_repeated_lines_are_written_a_few_times_and_then_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     now_ns = START_NS
     monkeypatch.setattr(logs, "monotonic_ns", lambda: now_ns)
     repeats = Repeats()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line where it fails; tests/system runs it where it works."""
+"""Failures of the command line; tests/system runs it successfully."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CELL = "name: c\nbox: {min: [0, 0, 0], max: [1, 1, 1]}\n"
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The one line on standard error of a command that fails."""
+    """Run a failing command and return its one line on standard error."""
     assert main(arguments) == 1
     line = capsys.readouterr().err
     assert line.startswith("master-server: ")
@@ -30,7 +30,7 @@ def cell(tmp_path: Path) -> Path:
     return path
 
 
-def test_without_a_cell_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_option_for_the_cell_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert "cell: field required" in run(capsys)
 
 
@@ -66,7 +66,7 @@ def test_a_state_folder_that_cannot_be_made_is_named(
     assert str(state_dir) in run(capsys, "--cell", str(cell), "--state-dir", str(state_dir))
 
 
-def test_a_new_token_is_told_by_its_file_alone(
+def test_only_the_file_of_a_new_token_is_printed(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.DEBUG)
@@ -74,7 +74,7 @@ def test_a_new_token_is_told_by_its_file_alone(
         assert main(("new-token", role, "--state-dir", str(tmp_path))) == 0
         path = tmp_path / f"{role}.token"
         printed = "".join(capsys.readouterr()) + caplog.text
-        assert f"the new token of the {role} lies in {path}" in printed
+        assert f"the new token of the {role} is in {path}" in printed
         assert path.read_text().strip() not in printed
 
 

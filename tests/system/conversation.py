@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a unit, an operator and a robot said to a master, byte by byte, and what it answered: recorded once a version.
+"""A unit, an operator and a robot that talk to a master: requests and answers byte by byte, recorded for each version.
 
 Recorded conversations stand in `tests/shared/golden`, one folder a version of the contract. They are never recorded
 anew: units of that version say the same for as long as they run.
@@ -21,6 +21,7 @@ import pytest
 
 from master_server.app import make_app
 from master_server.core import Master
+from master_server.persistence import Store
 from master_server.security import Access
 from shared.cell import Cell
 from shared.settings import Settings
@@ -51,7 +52,7 @@ class Step:
 
     @property
     def is_units(self) -> bool:
-        """Whether a unit asked, and not an operator, a robot or a reader."""
+        """Return True if a unit sent it, and not an operator, a robot or a reader."""
         return self.token == UNIT
 
     def document(self) -> dict[str, Any]:
@@ -83,6 +84,13 @@ class Step:
         )
 
 
+def versions() -> list[str]:
+    """Every recorded version of the contract, oldest first."""
+    return sorted(
+        (folder.name for folder in GOLDEN.iterdir()), key=lambda name: [int(part) for part in name.split(".")]
+    )
+
+
 def recorded(version: str) -> list[Step]:
     """The conversation of this version of the contract."""
     return [Step.of(kept) for kept in json.loads((GOLDEN / version / "conversation.json").read_text())]
@@ -109,12 +117,13 @@ def recorded_cell(version: str) -> tuple[dict[str, Any], dict[str, bytes]]:
 class Table:
     """A master of a recorded cell; its clock and its dice are those of the conversation."""
 
-    def __init__(self, version: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, version: str, monkeypatch: pytest.MonkeyPatch, store: Store | None = None) -> None:
         self.now_ns = BEGIN_NS
         dice = itertools.count(1000)
         monkeypatch.setattr(secrets, "randbits", lambda _: next(dice))
         document, meshes = recorded_cell(version)
-        self.master = Master(Cell.from_document(document, meshes), Settings())
+        cell = Cell.from_document(document, meshes)
+        self.master = Master(cell, Settings()) if store is None else Master(cell, Settings(), store)
         self.app = make_app(self.master, Access(UNIT.encode(), OPERATOR.encode()))
         for name, module in list(sys.modules.items()):
             if name.startswith("master_server.") and hasattr(module, "monotonic_ns"):

@@ -89,7 +89,7 @@ def test_the_operators_token_is_replaced_and_a_damaged_file_keeps_the_old_one(tm
         file = Path(cluster.unit_token_file).with_name("operator.token")
         old = file.read_text().strip()
         file.write_text("")
-        until(lambda: "the token before stays in force" in cluster.log("master"), "the warning", 5.0)
+        until(lambda: "the old token stays valid" in cluster.log("master"), "the warning", 5.0)
         assert cluster.put("/settings", {"voxel_size_m": 0.1})
         file.unlink()
         until(lambda: "No such file" in cluster.log("master"), "the other warning", 5.0)

@@ -47,16 +47,34 @@ from shared.messages import (
 )
 from shared.settings import Settings
 from shared.wire import decode, decode_update, decode_update_answer, encode, unpack
-from tests.system.conversation import GOLDEN, OPERATOR, UNIT, Step, Table, plain, recorded, recorded_cell
+from tests.system.conversation import (
+    GOLDEN,
+    OPERATOR,
+    UNIT,
+    Step,
+    Table,
+    plain,
+    recorded,
+    recorded_cell,
+    versions,
+)
 
 ANSWERS = {"/initialize": InitializeAnswer, "/robot": RobotAnswer, "/units/1/pose": PoseAnswer}
-"""What a unit reads, by path; beside the answers to updates, and the cell."""
+"""Answers that a unit reads, by path; besides them it reads the answers to updates, and the cell."""
+
+
+SENTENCES = ("reason", "reasons", "sentence", "detail", "outcome")
+"""Names of what is said to people; programs of 5.1 and later read the codes beside them."""
+
+VERSIONS = versions()
 
 
 def keeps(now: Any, before: Any) -> bool:
-    """Whether all that stood in `before` stands in `now`; names may have been added."""
+    """Return True if `now` has all that `before` has; names may have been added, and sentences may be other ones."""
     if isinstance(before, dict):
-        return isinstance(now, dict) and all(name in now and keeps(now[name], before[name]) for name in before)
+        return isinstance(now, dict) and all(
+            name in now and (name in SENTENCES or keeps(now[name], before[name])) for name in before
+        )
     if isinstance(before, list):
         return isinstance(now, list) and len(now) == len(before) and all(map(keeps, now, before))
     return bool(now == before)
@@ -73,17 +91,21 @@ def table(monkeypatch: pytest.MonkeyPatch) -> Table:
     return Table("5.0", monkeypatch)
 
 
-async def test_a_unit_of_5_0_is_answered_byte_by_byte_as_it_was(table: Table) -> None:
-    steps = recorded("5.0")
-    for now, before in zip(await table.replay(steps), steps, strict=True):
+@pytest.mark.parametrize("version", VERSIONS)
+async def test_a_unit_of_any_minor_is_answered_byte_by_byte_as_it_was(
+    monkeypatch: pytest.MonkeyPatch, version: str
+) -> None:
+    steps = recorded(version)
+    for now, before in zip(await Table(version, monkeypatch).replay(steps), steps, strict=True):
         assert now.status == before.status, before.name
         if before.is_units and before.status < 400:
             assert now.answer == before.answer, before.name
 
 
-async def test_readers_of_5_0_find_what_they_found(table: Table) -> None:
-    steps = recorded("5.0")
-    for now, before in zip(await table.replay(steps), steps, strict=True):
+@pytest.mark.parametrize("version", VERSIONS)
+async def test_readers_of_any_minor_find_what_they_found(monkeypatch: pytest.MonkeyPatch, version: str) -> None:
+    steps = recorded(version)
+    for now, before in zip(await Table(version, monkeypatch).replay(steps), steps, strict=True):
         if not before.is_units:
             assert keeps(plain(now), plain(before)), before.name
 
@@ -112,18 +134,23 @@ def test_an_outcome_of_a_unit_of_5_0(text: str, outcome: Outcome) -> None:
     assert Ended.of(1, outcome).outcome == outcome
 
 
-def answers() -> list[Step]:
-    return [step for step in recorded("5.0") if step.is_units and step.status < 400]
+def answers(version: str) -> list[Step]:
+    return [step for step in recorded(version) if step.is_units and step.status < 400]
 
 
-@pytest.mark.parametrize("step", answers(), ids=lambda step: step.name)
-def test_what_a_master_of_5_0_answered_is_read(step: Step) -> None:
+ANSWERED = [
+    pytest.param(version, step, id=f"{version} {step.name}") for version in VERSIONS for step in answers(version)
+]
+
+
+@pytest.mark.parametrize(("version", "step"), ANSWERED)
+def test_the_answers_of_a_master_of_any_minor_are_read(version: str, step: Step) -> None:
     path = step.path.split("?")[0]
     if path == "/update":
         assert list(decode_update_answer(step.answer).versions.model_dump().values()) == plain(step)["versions"]
         assert decode_update(step.body).id == 1
     elif path == "/cell":
-        assert Cell.from_document(plain(step), recorded_cell("5.0")[1]).name == "golden"
+        assert Cell.from_document(plain(step), recorded_cell(version)[1]).name == "golden"
     else:
         assert keeps(decode(ANSWERS[path], step.answer).model_dump(mode="json"), plain(step))
 
@@ -195,6 +222,16 @@ async def test_a_unit_ignores_what_it_need_not_know_of_a_newer_master(table: Tab
         assert (await client.initialize(request_of_now())).session == told["session"]
     update = {"versions": [1, 1, 1, 0, 3], "received_at_ns": 5, "answered_at_ns": 6, "mood": "good"}
     assert decode_update_answer(msgpack.packb(update)).versions == Versions(settings=1, lattice=1, cell=1)
+
+
+async def test_progress_and_outcomes_of_5_1_are_codes_and_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = {step.name: plain(step) for step in await Table("5.1", monkeypatch).replay(recorded("5.1"))}
+    learning = told["readers ask for the units that learn"][0]
+    assert (learning["cause"]["code"], learning["cause"]["numbers"]) == ("background", {"done": 3.0, "total": 60.0})
+    assert learning["health"]["progress"] == {"task": "background", "done": 3, "total": 60}
+    assert told["readers ask for the units"][0]["health"]["progress"]["task"] == "refinement"
+    assert told["readers ask for a map that is not complete"]["causes"][0]["code"] == "background"
+    assert told["readers ask what came of the fourth"][0]["last_command"]["code"] == "failed"
 
 
 async def test_a_unit_of_5_0_has_reasons_without_numbers(table: Table) -> None:
@@ -344,25 +381,28 @@ def test_a_master_of_5_0_announces_itself_without_a_minor() -> None:
     assert "update this unit first" in (objection(replace(heard, says=major), Wanted(), None) or "")
 
 
-def test_no_setting_of_5_0_has_another_name_or_default() -> None:
-    registered = next(step for step in answers() if step.path == "/initialize")
+@pytest.mark.parametrize("version", VERSIONS)
+def test_no_setting_of_any_minor_has_another_name_or_default(version: str) -> None:
+    registered = next(step for step in answers(version) if step.path == "/initialize")
     assert keeps(Settings().model_dump(mode="json"), plain(registered)["settings"])
 
 
-def test_what_a_recording_of_5_0_holds_is_read() -> None:
-    kept = json.loads((GOLDEN / "5.0" / "states.json").read_text())
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_states_of_a_recording_of_any_minor_are_read(version: str) -> None:
+    kept = json.loads((GOLDEN / version / "states.json").read_text())
     assert len(kept) == 2
     for state in kept:
         assert keeps(StateRecord.model_validate(state).model_dump(mode="json"), state)
 
 
-def test_a_master_of_now_goes_on_with_what_one_of_5_0_kept(tmp_path: Path) -> None:
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_master_of_now_goes_on_with_the_store_of_any_minor(tmp_path: Path, version: str) -> None:
     path = tmp_path / "master.db"
     with sqlite3.connect(path) as kept:
-        kept.executescript((GOLDEN / "5.0" / "master.sql").read_text())
+        kept.executescript((GOLDEN / version / "master.sql").read_text())
     kept.close()
     store = Store.open(path)
-    document, meshes = recorded_cell("5.0")
+    document, meshes = recorded_cell(version)
     one = Master(Cell.from_document(document, meshes), Settings(), store)
     store.close()
     (unit,) = one.registry

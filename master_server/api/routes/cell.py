@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cell: its document and meshes, which a unit keeps by their hashes, and what an operator changes of it."""
+"""The cell: its document and meshes, which a unit caches by their hashes, and changes by an operator."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from shared.wire import MAX_ANSWER_BYTES, MEDIA_TYPE, unpack
 router = APIRouter(tags=["cell"], route_class=Negotiated)
 uploads = APIRouter(tags=["cell"])
 
-Sha256 = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$", description="Of the mesh, as the cell's document has it.")]
-ObjectName = Annotated[str, Path(max_length=64, description="Of one of the cell's `objects`.")]
+Sha256 = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$", description="Hash of the mesh, as in the cell's document.")]
+ObjectName = Annotated[str, Path(max_length=64, description="Name of one of the cell's `objects`.")]
 
 ZIP = "application/zip"
 
 ZIP_TIMEOUT_S = 60.0
-"""For MAX_ZIP_BYTES over a network that is slow but works."""
+"""Time for MAX_ZIP_BYTES over a network that is slow but works."""
 
 WRITTEN_AT_ONCE = 2**20
-"""Bytes that wait to be written by a thread; smaller pieces would keep it busier with being told than with writing."""
+"""Bytes in one write of a thread; with smaller pieces, the hand-over would cost more than the writing."""
 
 
 @router.get("/cell", dependencies=READERS)
 async def cell(master: ReadableDependency, response: Response) -> dict[str, Any]:
-    """The cell as a document that names its meshes by sha256; the ETag is the sha256 of the document."""
+    """Return the cell as a document that names its meshes by sha256; the ETag is the sha256 of the document."""
     published = master.published
     response.headers["ETag"] = f'"{published.reference.sha256}"'
     return published.document
@@ -63,28 +63,28 @@ async def cell(master: ReadableDependency, response: Response) -> dict[str, Any]
     },
 )
 async def change_cell(request: Request, services: MasterServicesDependency) -> CellAnswer:
-    """Watch another cell from now on.
+    """Watch another cell.
 
-    Either its folder as a zip (`cell.yaml` at the root or in the one top folder, with the files that it names), or the
-    document of `GET /cell`, edited, with meshes of the current cell. What is no cell changes nothing.
+    The body is either its folder as a zip (`cell.yaml` at the root or in the only top folder, with the files that it
+    names), or the edited document of `GET /cell`, with meshes of the current cell. An invalid cell changes nothing.
     """
     loader, master = services.loader, services.master
     kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
     async with loader.folder() as folder:
         if kind == ZIP:
-            found = await _of_zip(request, loader, folder)
+            found = await _load_zip(request, loader, folder)
         elif kind in ("application/json", MEDIA_TYPE):
-            found = await loader.of_document(await _document(request, kind), master.published)
+            found = await loader.load_document(await _document(request, kind), master.published)
         else:
             raise Refusal(415, f"cell: expected the Content-Type {ZIP} or application/json, got {kind or 'none'}")
-    # Ahead and in a thread, since meshes may be large.
+    # Stored before the change and in a thread, since meshes may be large.
     await asyncio.to_thread(master.store.add_meshes, found.meshes)
     return master.change_cell(found)
 
 
 @router.put("/cell/objects/{name}/pose", dependencies=OPERATOR_ONLY)
 async def move_object(name: ObjectName, body: ObjectPoseRequest, master: MasterDependency) -> CellAnswer:
-    """A known object was moved, or is about to be; every unit has it with the answer to its next update."""
+    """Set the pose of a known object; every unit receives it with the answer to its next update."""
     return master.move_object(name, body.T_world_object)
 
 
@@ -95,7 +95,7 @@ async def move_object(name: ObjectName, body: ObjectPoseRequest, master: MasterD
     responses={200: {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}},
 )
 async def mesh(sha256: Sha256, master: ReadableDependency) -> Response:
-    """A mesh in its canonical bytes; it never changes, so keep it for ever."""
+    """Return a mesh in its canonical bytes; it never changes, so cache it for ever."""
     data = master.published.meshes.get(sha256)
     if data is None:
         raise Refusal(404, f"mesh {sha256}: it is not part of the current cell")
@@ -106,11 +106,11 @@ async def mesh(sha256: Sha256, master: ReadableDependency) -> Response:
     )
 
 
-# Its routes read their bodies by themselves: none is JSON of a few kilobytes.
+# Its routes read their bodies themselves, since none is a small JSON.
 router.include_router(uploads)
 
 
-async def _of_zip(request: Request, loader: CellLoader, folder: FilePath) -> PublishedCell:
+async def _load_zip(request: Request, loader: CellLoader, folder: FilePath) -> PublishedCell:
     archive = folder / "cell.zip"
     file = await asyncio.to_thread(archive.open, "wb")
     waiting = bytearray()
@@ -128,10 +128,10 @@ async def _of_zip(request: Request, loader: CellLoader, folder: FilePath) -> Pub
         await pour(request, MAX_ZIP_BYTES, ZIP_TIMEOUT_S, add)
         await flush()
     except OSError as error:
-        raise Refusal(507, f"cell: the zip cannot be kept while it is read: {error.strerror}") from error
+        raise Refusal(507, f"cell: the zip cannot be written to the disk: {error.strerror}") from error
     finally:
         await asyncio.to_thread(file.close)
-    return await loader.of_zip(archive, folder)
+    return await loader.load_zip(archive, folder)
 
 
 async def _document(request: Request, kind: str) -> Any:

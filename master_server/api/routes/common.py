@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all routes share: bodies in bounds, JSON or msgpack, tokens."""
+"""Shared parts of all routes: bounded bodies, JSON or msgpack, tokens."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from shared.wire import MEDIA_TYPE, unpack
 logger = logging.getLogger(__name__)
 
 MAX_BODY_BYTES = 2**18
-"""Of any request but updates, cells and meshes: settings, a pose, joints."""
+"""Bound of each request except updates, cells and meshes: settings, a pose, joints."""
 
 BODY_TIMEOUT_S = 5.0
-"""A unit sends a body in one go; who takes longer holds a connection for nothing."""
+"""A unit sends a body in one go; a slower sender would hold a connection for nothing."""
 
 CLOSING = frozenset({401, 408, 413, 429})
-"""Refused before the body was read, and nobody will read it."""
+"""Refusals before the body was read; the rest of the body is never read."""
 SHOWN_PATH_CHARS = 100
 """More than the longest path that the master has."""
 
@@ -43,10 +43,10 @@ IS_REPLAY = "this is a replay: nothing in it can be changed"
 
 
 async def body_of(request: Request, max_bytes: int) -> bytes:
-    """The whole body.
+    """Read the whole body.
 
     Raises:
-        Refusal: 413, more than `max_bytes`; 408, it came too slowly; 400, the sender went away.
+        Refusal: 413, more than `max_bytes`; 408, it came too slowly; 400, the sender closed the connection.
     """
     _check_declared(request, max_bytes)
     body = bytearray()
@@ -54,7 +54,7 @@ async def body_of(request: Request, max_bytes: int) -> bytes:
         if not await at_once_or_within(BODY_TIMEOUT_S, _read(request, max_bytes, body)):
             raise Refusal(408, f"body: expected all of it within {BODY_TIMEOUT_S:g} s, got {len(body)} bytes")
     except ClientDisconnect as error:
-        raise Refusal(400, "body: the sender went away") from error
+        raise Refusal(400, "body: the sender closed the connection") from error
     limits_of(request).read(ip_of(request.scope), len(body), monotonic_ns())
     return bytes(body)
 
@@ -62,7 +62,7 @@ async def body_of(request: Request, max_bytes: int) -> bytes:
 async def pour(
     request: Request, max_bytes: int, timeout_s: float, add: Callable[[bytes], Coroutine[Any, Any, None]]
 ) -> None:
-    """Hand a large body on as it comes.
+    """Pass on a large body as it arrives.
 
     Raises:
         Refusal: as in `body_of`.
@@ -82,11 +82,11 @@ async def pour(
         if not await within(timeout_s, read()):
             raise Refusal(408, f"body: expected all of it within {timeout_s:g} s, got {count} bytes")
     except ClientDisconnect as error:
-        raise Refusal(400, "body: the sender went away") from error
+        raise Refusal(400, "body: the sender closed the connection") from error
 
 
 def ip_of(scope: Scope) -> str:
-    """The address at the other end of the connection; no header can claim another."""
+    """Return the remote address of the connection; headers are ignored."""
     client = scope.get("client")
     if client is None:
         raise Refusal(400, "the connection has no address")
@@ -94,12 +94,12 @@ def ip_of(scope: Scope) -> str:
 
 
 def status_of(error: CellwatchError) -> int:
-    """The HTTP status of a refusal; what is not one by itself is wrong input."""
+    """Return the HTTP status of an error; an error without its own status is invalid input."""
     return error.status if isinstance(error, Refusal) else 422
 
 
 def refused(error: CellwatchError) -> Response:
-    """A refusal as every route answers it: one sentence."""
+    """Return a refusal in the form of every route: one sentence."""
     status = status_of(error)
     headers = {"Connection": "close"} if status in CLOSING else {}
     if isinstance(error, Refusal) and error.retry_after_s is not None:
@@ -108,21 +108,21 @@ def refused(error: CellwatchError) -> Response:
 
 
 def log_refusal(scope: Scope, error: CellwatchError) -> None:
-    """One line for whoever wonders why a request was refused; without the query, which is the caller's own affair."""
+    """Log a refused request in one line, without the query, which is private to the caller."""
     status = status_of(error)
     client = scope.get("client")
     ip = plain_ip(str(client[0])) if client else ""
     if not limits_of(HTTPConnection(scope)).may_be_logged(ip, monotonic_ns()):
         return
-    # A stranger may ask for any path.
+    # A stranger may request any path.
     path = repr(scope["path"])[1:-1][:SHOWN_PATH_CHARS]
-    asked = f"{scope.get('method', 'WS')} {path}"
+    requested = f"{scope.get('method', 'WS')} {path}"
     fields = {"event": "refusal", "ip": ip, "status": status}
-    logger.warning("%s from %s refused: %d, %s", asked, ip, status, error, extra=fields)
+    logger.warning("%s from %s refused: %d, %s", requested, ip, status, error, extra=fields)
 
 
 class Negotiated(APIRoute):
-    """JSON by default, msgpack where `Content-Type` or `Accept` says so; every body within bounds.
+    """JSON by default, msgpack if `Content-Type` or `Accept` says so; every body is bounded.
 
     Refusals are JSON always.
     """
@@ -141,20 +141,20 @@ class Negotiated(APIRoute):
 
 
 def wants_msgpack(request: Request) -> bool:
-    """Whether the caller asked for msgpack."""
+    """Return True if the caller requests msgpack."""
     return MEDIA_TYPE in request.headers.get("accept", "")
 
 
-# Dependencies are coroutines throughout: the framework sends plain functions to a thread, at ten times the cost.
+# All dependencies are coroutines: the framework runs plain functions in a thread, at ten times the cost.
 
 
 async def services_of(request: HTTPConnection) -> Services:
-    """What the routes of this application work with."""
+    """Return the objects that the routes of this application use."""
     return _services(request)
 
 
 async def master_services_of(request: HTTPConnection) -> MasterServices:
-    """The same of a master, for those who change something.
+    """Return the services of a master, for routes that change something.
 
     Raises:
         Refusal: 409, it is a replay.
@@ -170,27 +170,27 @@ MasterServicesDependency = Annotated[MasterServices, Depends(master_services_of)
 
 
 async def master_of(services: MasterServicesDependency) -> Master:
-    """The one master of this application; raises as `master_services_of`."""
+    """Return the master of this application; raises as `master_services_of`."""
     return services.master
 
 
 async def readable_of(services: ServicesDependency) -> Readable:
-    """The master of this application, or the recording of one, for those who only read."""
+    """Return the master of this application, or its recording, for routes that only read."""
     return services.master
 
 
 def access_of(request: HTTPConnection) -> Access:
-    """The tokens of this application."""
+    """Return the tokens of this application."""
     return _services(request).access
 
 
 def limits_of(request: HTTPConnection) -> Limits:
-    """What each address may ask for."""
+    """Return the rate limits of this application."""
     return _services(request).limits
 
 
 def stream_of(request: HTTPConnection) -> Stream:
-    """The listeners of this application."""
+    """Return the stream of this application."""
     return _services(request).stream
 
 
@@ -201,7 +201,7 @@ def _services(request: HTTPConnection) -> Services:
 
 
 def role_of(request: HTTPConnection, allowed: frozenset[Role], authorization: bytes | None = None) -> Role:
-    """Whose token came with this request, in its header or as `authorization` in the same form.
+    """Return the role of the token in this request's header, or in `authorization` in the same form.
 
     Raises:
         Refusal: 401 without a valid one, 403 with one of another role, 429 after too many wrong ones.
@@ -222,12 +222,12 @@ def role_of(request: HTTPConnection, allowed: frozenset[Role], authorization: by
 
 
 def authorization_of(request: HTTPConnection) -> bytes | None:
-    """The `Authorization` header as it came."""
+    """Return the `Authorization` header unchanged."""
     return next((value for name, value in request.scope["headers"] if name == b"authorization"), None)
 
 
 async def may_read(request: Request) -> None:
-    """Dependency: any token, or none where reads are public."""
+    """Dependency: any token, or none if reads are public."""
     if not access_of(request).public_reads:
         role_of(request, ANYONE)
 
@@ -243,11 +243,11 @@ async def is_unit(request: Request) -> None:
 
 
 async def is_known(request: Request) -> Role:
-    """Dependency: either token; tells whose it is."""
+    """Dependency: either token; returns its role."""
     return role_of(request, ANYONE)
 
 
-# Only so that the documentation of the API tells of it; the checks are above.
+# Only for the OpenAPI document; the checks are above.
 bearer = Depends(HTTPBearer(auto_error=False, description="The token of the units or of the operator."))
 
 MasterDependency = Annotated[Master, Depends(master_of)]
@@ -271,10 +271,10 @@ async def _read(request: Request, max_bytes: int, body: bytearray) -> None:
 
 
 async def _as_json(request: Request) -> Request:
-    """The same request with its body read within bounds, and as JSON if it was msgpack."""
+    """Return the same request with its body read within bounds, and as JSON if it was msgpack."""
     if request.method in ("GET", "DELETE", "HEAD"):
         return request
-    # Before anything is read, so that a stranger costs nothing; whose token it must be, each route checks.
+    # Before anything is read, so that a stranger costs nothing. Each route checks the role of the token.
     role_of(request, ANYONE)
     body = await body_of(request, MAX_BODY_BYTES)
     headers = request.scope["headers"]

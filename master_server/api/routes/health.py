@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the master lives, for service managers and balancers and so without a token; and how it fares."""
+"""Liveness for service managers and load balancers, without a token; and the metrics."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ router = APIRouter(tags=["health"])
 
 
 class HealthAnswer(BaseModel):
-    """`GET /healthz`: nothing that is not for everyone on the network."""
+    """`GET /healthz`: only fields that everyone on the network may know."""
 
     status: Literal["ok"]
     version: str
     uptime_s: float
-    units: int = Field(description="How many have a slot.")
-    live: int = Field(description="How many of them are live.")
-    storage: str = Field(description="`ok`, or why the last change could not be stored.")
+    units: int = Field(description="Number of slots.")
+    live: int = Field(description="Number of live units.")
+    storage: str = Field(description="`ok`, or a sentence if the last change could not be stored.")
 
 
 @router.get("/healthz")
 async def healthz(services: MasterServicesDependency) -> HealthAnswer:
-    """Answers while the event loop runs; whether the map is complete, `GET /voxels` tells."""
+    """Answer while the event loop runs; `GET /voxels` has the completeness of the map."""
     master, now_ns = services.master, monotonic_ns()
     return HealthAnswer(
         status="ok",
@@ -48,5 +48,5 @@ async def healthz(services: MasterServicesDependency) -> HealthAnswer:
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
 )
 async def metrics(services: MasterServicesDependency) -> Response:
-    """All series of the master, as Prometheus text."""
+    """Return all series of the master, as Prometheus text."""
     return Response(services.metrics.exposition(), media_type=CONTENT_TYPE_LATEST)

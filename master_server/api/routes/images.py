@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A unit's pictures, on request: nothing is sent or kept while nobody asks."""
+"""A unit's images, on request: without a request, none is sent or stored."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shared.messages import MAX_IMAGE_BYTES, PICTURE_RANGE_M, ImageKind
 
 router = APIRouter(tags=["units"])
 
-UnitId = Annotated[int, Path(ge=0, lt=2**31, description="Of `GET /units`.")]
+UnitId = Annotated[int, Path(ge=0, lt=2**31, description="Id in `GET /units`.")]
 
 PNG = "image/png"
 
@@ -30,11 +30,11 @@ async def image(
     services: MasterServicesDependency,
     raw: Annotated[bool, Query(description="16 bits in units of depth_scale instead of colours.")] = False,
 ) -> Response:
-    """A picture (PNG) of the unit's next frame: what it measures, what it expects, or what remains of both.
+    """Return an image (PNG) of the unit's next frame: measured depth, expected depth, or the remaining foreground.
 
-    In colours near is red and far is blue, over the metres that the header `X-Depth-Range-M` names; black is nothing.
+    In colours, near is red and far is blue, over the metres in the header `X-Depth-Range-M`; black is no value.
     """
-    png = await services.pictures.get(unit_id, kind, raw, monotonic_ns())
+    png = await services.image_requests.get(unit_id, kind, raw, monotonic_ns())
     headers = {"Cache-Control": "no-store"}
     if not raw:
         headers["X-Depth-Range-M"] = "{:g} {:g}".format(*PICTURE_RANGE_M)
@@ -54,10 +54,10 @@ async def put_image(
     kind: ImageKind,
     request: Request,
     services: MasterServicesDependency,
-    command: Annotated[int, Query(ge=0, lt=2**63, description="Which it answers.")],
+    command: Annotated[int, Query(ge=0, lt=2**63, description="Id of the command that it answers.")],
 ) -> None:
-    """A unit sends the picture that it was asked for; of its own only."""
+    """Accept the image that a unit was commanded to send; each unit sends only its own."""
     services.master.registry.own(unit_id, ip_of(request.scope))
-    pictures = services.pictures
-    pictures.check_awaited(unit_id, command)
-    pictures.deliver(unit_id, command, await body_of(request, MAX_IMAGE_BYTES))
+    requests = services.image_requests
+    requests.check_pending(unit_id, command)
+    requests.deliver(unit_id, command, await body_of(request, MAX_IMAGE_BYTES))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The merged map, how much of the cell is seen, how both were of late, and the settings that shape them."""
+"""The merged map, the coverage, the history of both, and the settings."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ async def voxels(
     request: Request,
     master: ReadableDependency,
     form: Annotated[Form, Query(description="Indices (N, 3), centres (N, 3) in m, or keys (N,).")] = "indices",
-    unseen: Annotated[bool, Query(description="Also the blocks that no live unit looks through.")] = False,
+    unseen: Annotated[bool, Query(description="Also return the blocks that no live unit sees.")] = False,
 ) -> Response:
-    """All obstacle voxels, each with the number of units that report it, and whether that is all there is."""
+    """Return all obstacle voxels, each with the number of units that report it, and the completeness of the map."""
     now_ns = monotonic_ns()
     unseen_blocks = unseen_fields(master.blocks_at(now_ns), master.seen_by(now_ns)) if unseen else None
     return _packed(request, map_fields(master.view(now_ns), form, unseen_blocks, now_ns))
@@ -51,21 +51,21 @@ async def voxels(
 async def coverage(
     request: Request,
     master: ReadableDependency,
-    blocks: Annotated[bool, Query(description="Also by how many units each block is seen, as runs.")] = False,
+    blocks: Annotated[bool, Query(description="Also return the number of units that see each block, as runs.")] = False,
 ) -> Response:
-    """How much of the cell live units look through now; what none does is unseen, not free."""
+    """Return the share of the cell that live units see now; all other blocks are unseen, not free."""
     return _packed(request, coverage_fields(master, blocks, monotonic_ns()))
 
 
 @router.get("/history", dependencies=READERS)
 async def history(services: ServicesDependency) -> HistoryAnswer:
-    """The last five minutes, one sample a second: the scene refresh time, voxels, live units."""
+    """Return the last five minutes, one sample a second: the scene refresh time, voxels, live units."""
     return services.history.answer(monotonic_ns())
 
 
 @router.get("/settings", dependencies=READERS)
 async def settings(master: ReadableDependency) -> Settings:
-    """What an operator may change while everything runs."""
+    """Return the settings that an operator may change at run time."""
     return master.settings
 
 
@@ -74,7 +74,7 @@ async def change_settings(
     master: MasterDependency,
     changes: Annotated[dict[str, Any], Body(examples=[{"voxel_size_m": 0.03}, {"stale_after_s": 0.4}])],
 ) -> Settings:
-    """Change some of them; the others stay. Every unit has them with the answer to its next update."""
+    """Change some settings; the others stay. Every unit receives them with the answer to its next update."""
     return master.change_settings(changes)
 
 

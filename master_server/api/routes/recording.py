@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording what the master sees, switched while it runs."""
+"""Start and stop a recording at run time."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ router = APIRouter(tags=["recording"], route_class=Negotiated)
 
 
 async def recorder_of(services: ServicesDependency) -> Recorder:
-    """The recorder of this application.
+    """Return the recorder of this application.
 
     Raises:
         Refusal: 409, it has none.
     """
     if services.recorder is None:
-        raise Refusal(409, "recording: there is nowhere to write to")
+        raise Refusal(409, "recording: this master has no folder to write to")
     return services.recorder
 
 
@@ -30,13 +30,13 @@ RecorderDependency = Annotated[Recorder, Depends(recorder_of)]
 
 @router.get("/recording", dependencies=READERS)
 async def status(recorder: RecorderDependency) -> RecordingStatus:
-    """Whether the master records, to which file, and what was left out."""
+    """Return the state of the recording, its file, and the number of dropped moments."""
     return recorder.status()
 
 
 @router.post("/recording", dependencies=OPERATOR_ONLY)
 async def start(recorder: RecorderDependency) -> RecordingStatus:
-    """Begin to record; refused (507) with the reason when the disk is full."""
+    """Start to record; refused (507) with the reason if the disk is full."""
     return await recorder.start()
 
 

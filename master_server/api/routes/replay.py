@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording played: where it stands, and what a replay refuses."""
+"""Control a replay, and refuse updates to it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ router = APIRouter(tags=["replay"], route_class=Negotiated)
 
 
 async def replay_of(master: ReadableDependency) -> Replay:
-    """The replay of this application."""
+    """Return the replay of this application."""
     assert isinstance(master, Replay)
     return master
 
@@ -27,24 +27,24 @@ ReplayDependency = Annotated[Replay, Depends(replay_of)]
 
 @router.get("/replay", dependencies=READERS)
 async def replay(replay: ReplayDependency) -> ReplayAnswer:
-    """Where the replay stands."""
+    """Return the state of the replay."""
     return replay.answer(monotonic_ns())
 
 
 @router.put("/replay", dependencies=OPERATOR_ONLY)
 async def change_replay(body: ReplayRequest, replay: ReplayDependency) -> ReplayAnswer:
-    """Go elsewhere in it, pause it, or play it at another speed."""
+    """Seek, pause, or play at another speed."""
     return replay.change(body, monotonic_ns())
 
 
 @router.get("/healthz")
 async def healthz() -> dict[str, Any]:
-    """Answers while the event loop runs, and tells that this is no master."""
+    """Answer while the event loop runs, and state that this is a replay, not a master."""
     return {"status": "ok", "replay": True}
 
 
 class RefusedUpdate:
-    """`POST /update` of a unit that takes a replay for a master: an ASGI application for the one path."""
+    """`POST /update` of a unit that mistakes a replay for a master: an ASGI application for the one path."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         await JSONResponse({"detail": IS_REPLAY}, 409)(scope, receive, send)

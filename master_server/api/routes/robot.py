@@ -24,7 +24,7 @@ router = APIRouter(tags=["robot"], route_class=Negotiated)
 
 @router.put("/robot/joints", dependencies=OPERATOR_ONLY, status_code=204)
 async def put_joints(body: JointsRequest, master: MasterDependency) -> None:
-    """Where the robot is; the more often the better, 125 times a second is good."""
+    """Store the robot's joints; send them often: 125 times a second is good."""
     master.put_joints(body, monotonic_ns())
 
 
@@ -36,9 +36,9 @@ async def robot(
         int | None, Query(ge=0, lt=2**63, description="All samples after this time, not only the newest.")
     ] = None,
 ) -> Response:
-    """Whether the robot reports, and its joints by the master's clock, of which `now_ns` is now."""
+    """Return the robot's state, and its joints by the master's clock, whose present time is `now_ns`."""
     answer = master.robot_answer(since_ns, monotonic_ns())
-    # Units ask before every frame, so not by way of JSON.
+    # Units poll this before every frame, so encode msgpack directly, without JSON.
     if wants_msgpack(request):
         return Response(encode(answer), media_type=MEDIA_TYPE)
     return Response(answer.model_dump_json(), media_type="application/json")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A WebSocket served until one side goes, or the token that opened it was replaced."""
+"""Serve a WebSocket until one side ends it, or the token that opened it is replaced."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fastapi import WebSocket, WebSocketDisconnect
 from fastapi.websockets import WebSocketState
 
 TOKEN_REPLACED = 1008
-"""What a socket is closed with whose token holds no more: a policy, says RFC 6455."""
+"""Close code for a socket whose token was replaced: a policy violation by RFC 6455."""
 
 
 async def serve(
@@ -21,10 +21,10 @@ async def serve(
     *works: Coroutine[Any, Any, None],
     gone: tuple[type[Exception], ...] = (),
 ) -> None:
-    """Do the `works` of an accepted socket at once, until one of them ends or the token does.
+    """Run all `works` of an accepted socket until one of them ends or the token is replaced.
 
-    `gone` is what a work raises, besides `WebSocketDisconnect`, when the side that it talks to has left; what else
-    one raises is raised once all have ended.
+    Besides `WebSocketDisconnect`, a work raises `gone` when its peer has left. Any other exception is raised once all
+    works have ended.
     """
     tasks: list[asyncio.Task[object]] = [asyncio.ensure_future(work) for work in (*works, token_ended.wait())]
     try:

@@ -2,7 +2,7 @@
 """`WS /stream`: the merged map as it changes.
 
 A token comes in the `Authorization` header or, since browsers cannot set one, as the WebSocket subprotocol
-`bearer.<token>` beside `cellwatch`. It is taken from no address: those stand in histories and in the logs of proxies.
+`bearer.<token>` beside `cellwatch`. It is never taken from an address, since histories and proxy logs keep addresses.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Literal
 from fastapi import APIRouter, WebSocket
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from master_server.api.map_stream import Listener, Wish
+from master_server.api.map_stream import Listener, StreamFormat
 from master_server.api.responses import Form
 from master_server.api.routes.common import access_of, ip_of, log_refusal, refused, role_of, stream_of
 from master_server.api.routes.sockets import serve
@@ -27,13 +27,13 @@ logger = logging.getLogger(__name__)
 router = APIRouter(tags=["map"])
 
 SUBPROTOCOL = "cellwatch"
-"""What the master agrees to: a browser wants one of those that it offered, and the token must not come back."""
+"""The agreed subprotocol: a browser requires one of those that it offered, and the token must not be sent back."""
 
 BEARER = "bearer."
 
 
 class StreamQuery(BaseModel):
-    """How the reader wants it."""
+    """The format that the reader requests."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -44,16 +44,16 @@ class StreamQuery(BaseModel):
 
 @router.websocket("/stream")
 async def stream(websocket: WebSocket) -> None:
-    """The newest map at each change, as `StreamMessage`; who is slow skips."""
+    """Send the newest map at each change, as `StreamMessage`; a slow reader skips messages."""
     source = stream_of(websocket)
     try:
         _refuse_token(websocket)
         access = access_of(websocket)
-        # A public stream was opened with no token that could be replaced.
+        # A public stream was opened without a token, so none can be replaced.
         token_ended = asyncio.Event()
         if not access.public_reads:
             token_ended = access.end_of(role_of(websocket, ANYONE, _authorization(websocket)))
-        listener = source.listen(_wish(websocket))
+        listener = source.listen(_format_of(websocket))
     except Refusal as refusal:
         log_refusal(websocket.scope, refusal)
         await websocket.send_denial_response(refused(refusal))
@@ -61,12 +61,13 @@ async def stream(websocket: WebSocket) -> None:
     fields = {"event": "stream", "ip": ip_of(websocket.scope)}
     with listener:
         await websocket.accept(SUBPROTOCOL if SUBPROTOCOL in websocket.scope["subprotocols"] else None)
-        logger.info("reader %s listens (%d in all)", fields["ip"], len(source), extra=fields)
+        logger.info("reader %s connected (%d in all)", fields["ip"], len(source), extra=fields)
         try:
             await serve(websocket, token_ended, _send(websocket, listener), _until_gone(websocket))
         finally:
             sent, skipped = listener.sent, listener.skipped
-            logger.info("reader %s is gone: %d messages sent, %d skipped", fields["ip"], sent, skipped, extra=fields)
+            text = "reader %s disconnected: %d messages sent, %d skipped"
+            logger.info(text, fields["ip"], sent, skipped, extra=fields)
 
 
 async def _send(websocket: WebSocket, listener: Listener) -> None:
@@ -79,7 +80,7 @@ async def _send(websocket: WebSocket, listener: Listener) -> None:
 
 
 async def _until_gone(websocket: WebSocket) -> None:
-    """Take in, and pass over, whatever a reader says."""
+    """Receive and ignore all messages of a reader until it disconnects."""
     while (await websocket.receive())["type"] != "websocket.disconnect":
         pass
 
@@ -95,14 +96,14 @@ def _authorization(websocket: WebSocket) -> bytes | None:
 
 
 def _refuse_token(websocket: WebSocket) -> None:
-    """Whoever puts a token here learns it at once, whether it is the right one or not."""
+    """Refuse a token in the address, valid or not, so that its sender learns it at once."""
     if "token" in websocket.query_params:
         raise Refusal(400, "token: expected in the Authorization header or as subprotocol bearer.<token>, not here")
 
 
-def _wish(websocket: WebSocket) -> Wish:
+def _format_of(websocket: WebSocket) -> StreamFormat:
     try:
         query = StreamQuery.model_validate(dict(websocket.query_params))
     except ValidationError as error:
         raise Refusal(422, sentence(error)) from error
-    return Wish(query.form, query.encoding, query.unseen)
+    return StreamFormat(query.form, query.encoding, query.unseen)

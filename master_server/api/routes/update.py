@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`POST /update`: bytes in, arrays merged, bytes out, with no framework on the way.
+"""`POST /update`: decode, merge, answer, without a framework in between.
 
-Fifty units at 30 frames a second take it 1,500 times a second.
+Fifty units at 30 frames a second call it 1,500 times a second.
 """
 
 from __future__ import annotations

@@ -64,19 +64,22 @@ def board_picture() -> NDArray[np.uint8]:
 
 
 async def test_it_scans_until_it_has_enough_images() -> None:
-    source, told = Pictures(board_picture(), EMPTY), list[str]()
+    source, reported = Pictures(board_picture(), EMPTY), list[tuple[str, int]]()
     search = BoardSearch(source, "infrared")
-    found = await search.scan(BOARD, told.append)
+    found = await search.scan(BOARD, lambda *progress: reported.append(progress))
     assert np.abs(found.T_world_camera - inverse(T_CAMERA_BOARD)).max() < 2e-3
     assert found.frames_used == GOOD_FRAMES
-    assert told[:2] == ["looking for the board: 12 of 12 markers", "looking for the board: 0 of 12 markers"]
+    assert reported[:2] == [
+        ("searching for the board: 12 of 12 markers", 1),
+        ("searching for the board: 0 of 12 markers", 1),
+    ]
     assert not source.looking
     assert search.outcome == ""
 
 
 async def test_an_uncertain_pose_takes_more_images(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("edge_unit.calibration.board_scan.GOOD_MM", 0.0)
-    found = await BoardSearch(Pictures(board_picture()), "infrared").scan(BOARD, lambda seen: None)
+    found = await BoardSearch(Pictures(board_picture()), "infrared").scan(BOARD, lambda *progress: None)
     assert found.frames_used == FRAMES
 
 
@@ -85,7 +88,7 @@ async def test_without_a_board_it_scans_with_growing_pauses() -> None:
     search = BoardSearch(source, "infrared", clock)
     assert search.due
     with pytest.raises(BoardError, match="none of the board's 12 markers"):
-        await search.scan(BOARD, lambda seen: None)
+        await search.scan(BOARD, lambda *progress: None)
     assert source.taken == EMPTY_FRAMES - 1
     first_ns = clock.now + round(RETRY_MIN_S * S)
     clock.go_to(first_ns - 1)
@@ -93,7 +96,7 @@ async def test_without_a_board_it_scans_with_growing_pauses() -> None:
     clock.go_to(first_ns)
     assert search.due
     with pytest.raises(BoardError):
-        await search.scan(BOARD, lambda seen: None)
+        await search.scan(BOARD, lambda *progress: None)
     clock.go_to(first_ns + 2 * round(RETRY_MIN_S * S) - 1)
     assert not search.due
     assert "none of the board's" in search.outcome
@@ -105,9 +108,9 @@ async def test_a_source_without_images() -> None:
     search = BoardSearch(object(), "infrared")
     assert not search.due
     with pytest.raises(BoardError, match="no images"):
-        await search.scan(BOARD, lambda seen: None)
+        await search.scan(BOARD, lambda *progress: None)
     with pytest.raises(SourceError, match="delivered no image"):
-        await BoardSearch(Pictures(), "infrared").scan(BOARD, lambda seen: None)
+        await BoardSearch(Pictures(), "infrared").scan(BOARD, lambda *progress: None)
 
 
 @pytest.mark.parametrize("stream", ["infrared", "color"])
@@ -117,7 +120,7 @@ async def test_a_simulated_camera_finds_its_pose_by_the_demo_cells_board(stream:
         camera = await source.open()
         assert camera.T_world_camera is None
         assert demo.board is not None
-        found = await BoardSearch(source, stream).scan(demo.board, lambda seen: None)
+        found = await BoardSearch(source, stream).scan(demo.board, lambda *progress: None)
     finally:
         await source.close()
     off = inverse(rig(demo, 4)[1]) @ found.T_world_camera

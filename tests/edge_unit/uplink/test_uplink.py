@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, cast
 
+import msgpack
 import numpy as np
 import pytest
 
@@ -23,9 +24,10 @@ from edge_unit.uplink.outbox import HEARTBEAT_S
 from edge_unit.uplink.uplink import Uplink
 from shared.camera import Intrinsics
 from shared.cell import Cell
-from shared.errors import MasterRefused, MasterUnreachable, WireError
+from shared.errors import MasterRefused, MasterUnreachable, NewerContract, WireError
 from shared.lattice import Lattice
 from shared.messages import (
+    CONTRACT_MINOR,
     MAX_SEEN_BYTES,
     CellReference,
     Command,
@@ -155,16 +157,16 @@ class Bench:
     def keys(self) -> list[int]:
         return [update.keys[0] if update.keys else -1 for update in self.master.updates]
 
-    async def until(self, look: Callable[[], Any]) -> None:
+    async def until(self, look: Callable[[], Any], calls: int = CALLS) -> None:
         """Let the uplink do all that it can, and then go on to the clock's next call, until `look` finds something."""
-        for _ in range(CALLS):
+        for _ in range(calls):
             for _ in range(TURNS):
                 if look():
                     return
                 await asyncio.sleep(0)
             assert self.clock.due_ns() is not None, "the uplink waits for nothing that comes"
             self.clock.step()
-        pytest.fail(f"not within {CALLS} calls of the clock")
+        pytest.fail(f"not within {calls} calls of the clock")
 
 
 @contextlib.asynccontextmanager
@@ -395,3 +397,41 @@ def test_a_cut_that_heals_at_the_worst_moment_costs_less_than_a_second() -> None
     assert TIMEOUT.connect is not None
     # A connection asked for just before, the longest pause behind it, and a fifth of a second to register and report.
     assert TIMEOUT.connect + 1.2 * module.RETRY_MAX_S + 0.2 <= 1.0
+
+
+class NewerMaster(FakeMaster):
+    """A master of the next minor, whose registration says something that this unit does not know."""
+
+    async def initialize(self, request: InitializeRequest) -> InitializeAnswer:
+        answer = await super().initialize(request)
+        newer = answer.model_dump(mode="json") | {"contract_minor": CONTRACT_MINOR + 1}
+        raise NewerContract("settings.fog: extra inputs are not permitted", msgpack.packb(newer))
+
+
+async def test_a_master_that_is_not_understood_is_asked_again_with_growing_pauses() -> None:
+    bench = Bench()
+    bench.master = bench.uplink._client = NewerMaster(bench.clock)
+    registered_ns: list[int] = []
+
+    def registered(count: int) -> bool:
+        while len(registered_ns) < len(bench.master.registrations):
+            registered_ns.append(bench.clock.now)
+        return len(registered_ns) >= count
+
+    task = asyncio.create_task(bench.uplink.run())
+    bench.uplink.set_camera(CAMERA, None)
+    try:
+        await bench.until(lambda: registered(1))
+        # The trouble goes out at once, not with the first heartbeat.
+        before_ns = bench.clock.now
+        await bench.until(lambda: bench.master.updates)
+        assert bench.clock.now - before_ns < HEARTBEAT_S * S / 2
+        for count in (2, 3, 4):
+            await bench.until(lambda count=count: registered(count), calls=10_000)
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+    pauses_s = [(after - before) / S for before, after in pairwise(registered_ns)]
+    assert pauses_s == pytest.approx([5.0, 10.0, 20.0], abs=2 * HEARTBEAT_S)
+    assert {update.health.trouble_code for update in bench.master.updates} == {"contract"}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bodies of `/update` that were real once: flipped, cut, spliced, with fields of other types and huge lengths."""
+"""Make mutated bodies of `/update`: flipped, cut, spliced, with fields of other types and huge lengths."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ VALUES: tuple[Any, ...] = (
     None, True, False, -1, 0, 1, 2**31, 2**32, 2**63 - 1, 2**64 - 1, -(2**63), 0.5, float("nan"), float("inf"), -1e308,
     "", "x", "\0", "\n", "a" * 300, b"", b"\xff" * 3, b"\0" * 4, b"\0" * 8, [], [[]], [0] * 5, {}, {"x": 1}, {1: 2},
 )  # fmt: skip
-"""In place of a field."""
+"""Replacements of a field."""
 
 LENGTHS = (b"\xc6\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xff", b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff")
-"""Binary, text, array and map that say they are 4 GiB long."""
+"""Headers of binary, text, array and map that claim a length of 4 GiB."""
 
 
 def mutated(rng: random.Random, corpus: Sequence[bytes]) -> bytes:
-    """One body that most likely is none."""
+    """Return a body that is most likely invalid."""
     body = rng.choice(corpus)
     how = rng.randrange(6)
     if how == 0:
@@ -75,12 +75,12 @@ def _with_nested(rng: random.Random, body: bytes) -> bytes:
 
 
 def _value(rng: random.Random) -> Any:
-    """One of its own: a list that is put into a list of the next round must not come to hold itself."""
+    """Return a new value each time: a list that is inserted in the next round must never contain itself."""
     return copy.deepcopy(rng.choice(VALUES))
 
 
 def _keys(rng: random.Random) -> bytes:
-    """Keys that ascend, or do not, in the lattice, or beyond it."""
+    """Return keys, ascending or not, within the lattice or beyond it."""
     count = rng.randrange(50)
     keys = [rng.choice((rng.randrange(8000), rng.randrange(2**32))) for _ in range(count)]
     if rng.random() < 0.5:

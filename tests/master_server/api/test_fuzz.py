@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A unit that sends nonsense: nothing breaks, nothing of the others changes, and no memory is lost."""
+"""Invalid updates: the master goes on, no other unit's data changes, and no memory leaks."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ SHORT, LONG = 3_000, 100_000
 SEED = 20_24
 WARM_UP = 1_000
 GROWTH_MAX_BYTES = 2**18
-"""Over any number of bodies; a leak of one object a body would be a hundred times as much."""
+"""Bound for any number of bodies; a leak of one object per body would be a hundred times as much."""
 
 STRANGERS = 50
-"""Addresses without a slot that send, too."""
+"""Addresses without a slot that also send."""
 
 
 async def send(app: Any, body: bytes, ip: str) -> int:
-    """The body through the application as a server would hand it over; returns the status."""
+    """Send the body to the application as a server would; return the status."""
     statuses = []
 
     async def receive() -> dict[str, Any]:
@@ -59,7 +59,7 @@ async def send(app: Any, body: bytes, ip: str) -> int:
 
 
 def corpus(unit: FakeUnit) -> list[bytes]:
-    """What a unit really sends: with and without voxels, with a seen report, with trouble, at its very first."""
+    """Return real updates: with and without voxels, with a seen report, with trouble, and a first one."""
     now_ns = monotonic_ns()
     rng = np.random.default_rng(1)
     few, many = rng.choice(8000, 20, replace=False), rng.choice(8000, 500, replace=False)
@@ -74,7 +74,7 @@ def corpus(unit: FakeUnit) -> list[bytes]:
 
 
 def known_of(desk: Desk, unit: FakeUnit) -> tuple[Any, ...]:
-    """All that the master knows of one unit, but for how old it is."""
+    """Return all that the master knows of one unit, except its age."""
     state = desk.app.services.master
     slot = next(slot for slot in state.registry if slot.id == unit.initialized.id)
     keys, _ = state.map.voxels()
@@ -90,7 +90,7 @@ def known_of(desk: Desk, unit: FakeUnit) -> tuple[Any, ...]:
 async def test_mutated_updates(count: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     # Kept by pytest, not by the master.
     caplog.set_level(logging.ERROR, "master_server")
-    # It is the bodies that are tried here, not how many may come.
+    # The rate limit is not under test here.
     monkeypatch.setattr(limits_module, "REQUESTS_BURST", 10**9)
     watched = master(with_robot=False, stale_after_s=60.0)
     desk = Desk(make_app(watched, Access(UNIT.encode(), OPERATOR.encode())))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Listeners without a network, by a clock that goes on only when it is told to."""
+"""Listeners without a network, with a clock that the test advances."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from master_server.api.map_stream import (
     PERIOD_MIN_NS,
     Listener,
     Stream,
-    Wish,
+    StreamFormat,
 )
 from master_server.api.responses import StreamMessage
 from master_server.core import Master
@@ -29,10 +29,10 @@ from shared.waiting import within
 from tests.master_server.fakes import MS, START_NS, FakeUnit, joined, master, sees_all
 from tests.set_clock import SetClock
 
-KEYS = Wish("keys")
+KEYS = StreamFormat("keys")
 
 PATIENCE_S = 10.0
-"""For what has to come at once on a quiet machine; by the real clock, and so never measured."""
+"""Timeout for a message that comes at once on an idle machine; by the real clock, so no test measures it."""
 
 
 @pytest.fixture
@@ -41,19 +41,19 @@ def clock() -> SetClock:
 
 
 @pytest.fixture(autouse=True)
-def pictures_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a busy machine the stream rests longer after a picture; how long, one test sets by itself."""
+def snapshots_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make snapshots cost nothing: on a busy machine the stream pauses longer after one. One test sets its own cost."""
     monkeypatch.setattr(stream_module, "stage_ns", lambda: 0)
 
 
 @pytest.fixture
 def robotic() -> Master:
-    """A master of a cell with a robot; it reads files, so not in a loop."""
+    """Return a master of a cell with a robot; it reads files, so outside of an event loop."""
     return master(with_robot=True, robot_stale_after_s=0.4)
 
 
-async def heard(listener: Listener) -> dict[str, Any]:
-    """The message that is there for the listener."""
+async def received(listener: Listener) -> dict[str, Any]:
+    """Return the listener's waiting message."""
     messages: list[bytes | str] = []
 
     async def take() -> None:
@@ -66,10 +66,10 @@ async def heard(listener: Listener) -> dict[str, Any]:
     return found
 
 
-async def next_heard(clock: SetClock, listener: Listener) -> dict[str, Any]:
-    """The message that the next call of the clock makes."""
+async def next_received(clock: SetClock, listener: Listener) -> dict[str, Any]:
+    """Return the message of the clock's next call."""
     at_ns = clock.step()
-    message = await heard(listener)
+    message = await received(listener)
     assert message["now_ns"] == at_ns
     return message
 
@@ -85,42 +85,42 @@ async def test_the_first_message_comes_at_once_and_each_change_after_it(clock: S
     unit = live(one, 1, 5)
     stream = Stream(one, clock)
     with stream.listen(KEYS) as listener:
-        first = await next_heard(clock, listener)
+        first = await next_received(clock, listener)
         assert first["now_ns"] == START_NS
         assert (first["voxels"], first["witnesses"], first["complete"]) == ([5], [1], True)
         assert [(row["id"], row["state"], row["voxels"]) for row in first["units"]] == [(1, "live", 1)]
         clock.go_to(START_NS + 2 * PERIOD_MIN_NS)
         unit.update(clock.now, [6, 7], age_ns=MS)
-        second = await next_heard(clock, listener)
+        second = await next_received(clock, listener)
         assert second["now_ns"] == START_NS + 2 * PERIOD_MIN_NS
         assert second["voxels"] == [6, 7]
         assert second["number"] == first["number"] + 1
     assert len(stream) == 0
 
 
-async def test_what_an_operator_and_the_robot_do_is_told_too(robotic: Master, clock: SetClock) -> None:
+async def test_changes_by_an_operator_and_the_robot_are_sent_too(robotic: Master, clock: SetClock) -> None:
     unit = live(robotic, 1, 5)
     with Stream(robotic, clock).listen(KEYS) as listener:
-        assert (await next_heard(clock, listener))["reasons"] == ["the robot has not reported its joints yet"]
+        assert (await next_received(clock, listener))["reasons"] == ["the robot has not reported its joints yet"]
         robotic.put_joints(JointsRequest(positions=(0.0, 0.0)), clock.now)
-        assert (await next_heard(clock, listener))["complete"]
+        assert (await next_received(clock, listener))["complete"]
         robotic.change_settings({"voxel_size_m": 0.1})
-        changed = await next_heard(clock, listener)
+        changed = await next_received(clock, listener)
         assert changed["lattice"]["voxel_size_m"] == 0.1
         assert changed["voxels"] == []
         robotic.forget(unit.initialized.id)
-        assert (await next_heard(clock, listener))["units"] == []
+        assert (await next_received(clock, listener))["units"] == []
         assert clock.now == START_NS + 3 * PERIOD_MIN_NS
 
 
 @pytest.mark.parametrize("stale_after_s", [0.06, 0.3])
-async def test_a_unit_that_falls_silent_is_told_at_its_moment(stale_after_s: float, clock: SetClock) -> None:
+async def test_a_stale_unit_is_sent_when_it_becomes_stale(stale_after_s: float, clock: SetClock) -> None:
     one = master(stale_after_s=stale_after_s)
     stream = Stream(one, clock)
     live(one, 1, 5)
     with stream.listen(KEYS) as listener:
-        assert (await next_heard(clock, listener))["complete"]
-        message = await next_heard(clock, listener)
+        assert (await next_received(clock, listener))["complete"]
+        message = await next_received(clock, listener)
         # Its frame was captured 1 ms before the start.
         assert message["now_ns"] == START_NS - MS + round(stale_after_s * NS_PER_S) + DUE_SLACK_NS
         assert not message["complete"]
@@ -128,38 +128,38 @@ async def test_a_unit_that_falls_silent_is_told_at_its_moment(stale_after_s: flo
         assert message["units"][0]["state"] == "stale"
 
 
-async def test_a_robot_that_falls_silent_is_told_at_its_moment(robotic: Master, clock: SetClock) -> None:
+async def test_a_stale_robot_is_sent_when_it_becomes_stale(robotic: Master, clock: SetClock) -> None:
     robotic.change_settings({"stale_after_s": 60.0})
     live(robotic, 1, 5)
     robotic.put_joints(JointsRequest(positions=(0.0, 0.0)), START_NS)
     with Stream(robotic, clock).listen(KEYS) as listener:
-        assert (await next_heard(clock, listener))["complete"]
-        message = await next_heard(clock, listener)
+        assert (await next_received(clock, listener))["complete"]
+        message = await next_received(clock, listener)
         assert not message["complete"]
         assert message["now_ns"] == START_NS + 400 * MS + DUE_SLACK_NS
 
 
 async def test_without_any_change_there_is_a_heartbeat(clock: SetClock) -> None:
     with Stream(master(), clock).listen(KEYS) as listener:
-        first, second = await next_heard(clock, listener), await next_heard(clock, listener)
+        first, second = await next_received(clock, listener), await next_received(clock, listener)
         assert second["number"] == first["number"] + 1
         assert second["now_ns"] - first["now_ns"] == HEARTBEAT_NS
         assert second["reasons"] == ["there is no unit"]
 
 
-async def test_the_timer_rests_while_nobody_listens(clock: SetClock) -> None:
+async def test_the_timer_is_idle_without_listeners(clock: SetClock) -> None:
     one = master()
     unit = live(one)
     stream = Stream(one, clock)
     assert clock.due_ns() is None
     with stream.listen(KEYS) as listener:
-        await next_heard(clock, listener)
+        await next_received(clock, listener)
     clock.step()
     unit.update(clock.now, [1], age_ns=MS)
-    assert stream.picture is None
+    assert stream.snapshot is None
     assert clock.due_ns() is None
     with stream.listen(KEYS) as listener:
-        assert (await next_heard(clock, listener))["voxels"] == [1]
+        assert (await next_received(clock, listener))["voxels"] == [1]
         stream.stop()
         assert clock.due_ns() is None
 
@@ -168,34 +168,34 @@ async def test_many_updates_make_few_messages(clock: SetClock) -> None:
     one = master()
     unit = live(one)
     with Stream(one, clock).listen(KEYS) as listener:
-        times_ns = [(await next_heard(clock, listener))["now_ns"]]
+        times_ns = [(await next_received(clock, listener))["now_ns"]]
         for _ in range(5):
             for key in range(20):
                 unit.update(clock.now, [key], age_ns=MS)
-            message = await next_heard(clock, listener)
+            message = await next_received(clock, listener)
             assert message["voxels"] == [19]
             times_ns.append(message["now_ns"])
         assert times_ns == [START_NS + number * PERIOD_MIN_NS for number in range(6)]
         assert listener.skipped == 0
 
 
-async def test_who_comes_late_has_the_newest_and_the_others_missed_nothing(clock: SetClock) -> None:
+async def test_a_late_listener_gets_the_newest_and_the_others_miss_nothing(clock: SetClock) -> None:
     one = master()
     unit = live(one)
     stream = Stream(one, clock)
     with stream.listen(KEYS) as slow, stream.listen(KEYS) as quick:
         clock.step()
-        await heard(slow)
-        await heard(quick)
+        await received(slow)
+        await received(quick)
         for key in range(1, 6):
             unit.update(clock.now, [key], age_ns=MS)
-            assert (await next_heard(clock, quick))["voxels"] == [key]
-        assert (await heard(slow))["voxels"] == [5]
+            assert (await next_received(clock, quick))["voxels"] == [key]
+        assert (await received(slow))["voxels"] == [5]
         assert (quick.skipped, slow.skipped) == (0, 4)
         assert (quick.sent, slow.sent) == (6, 2)
 
 
-async def test_listeners_of_one_wish_share_one_encoding(monkeypatch: pytest.MonkeyPatch, clock: SetClock) -> None:
+async def test_listeners_of_one_format_share_one_encoding(monkeypatch: pytest.MonkeyPatch, clock: SetClock) -> None:
     encoded: list[str] = []
     original = stream_module.map_fields
 
@@ -207,7 +207,10 @@ async def test_listeners_of_one_wish_share_one_encoding(monkeypatch: pytest.Monk
     one = master()
     live(one, 1, 411)
     stream = Stream(one, clock)
-    listeners = [stream.listen(wish) for wish in (KEYS, KEYS, KEYS, Wish("centres"), Wish("keys", "json"))]
+    listeners = [
+        stream.listen(stream_format)
+        for stream_format in (KEYS, KEYS, KEYS, StreamFormat("centres"), StreamFormat("keys", "json"))
+    ]
     clock.step()
     messages = [await listener.next() for listener in listeners]
     assert messages[0] is messages[1] is messages[2]
@@ -216,17 +219,17 @@ async def test_listeners_of_one_wish_share_one_encoding(monkeypatch: pytest.Monk
     assert isinstance(messages[4], str)
 
 
-async def test_unseen_blocks_only_for_who_wants_them(clock: SetClock) -> None:
+async def test_unseen_blocks_are_sent_only_on_request(clock: SetClock) -> None:
     one = master()
     joined(one, 1).update(START_NS, age_ns=MS)
     stream = Stream(one, clock)
-    with stream.listen(KEYS) as without, stream.listen(Wish("keys", unseen=True)) as with_unseen:
+    with stream.listen(KEYS) as without, stream.listen(StreamFormat("keys", unseen=True)) as with_unseen:
         clock.step()
-        assert (await heard(without))["unseen"] is None
-        assert len((await heard(with_unseen))["unseen"]["blocks"]) == 10 * 20 * 5
+        assert (await received(without))["unseen"] is None
+        assert len((await received(with_unseen))["unseen"]["blocks"]) == 10 * 20 * 5
 
 
-async def test_there_is_an_end_to_listeners(clock: SetClock) -> None:
+async def test_the_number_of_listeners_is_bounded(clock: SetClock) -> None:
     stream = Stream(master(), clock)
     listeners = [stream.listen(KEYS) for _ in range(MAX_LISTENERS)]
     with pytest.raises(Refusal, match=str(MAX_LISTENERS)) as caught:
@@ -236,7 +239,7 @@ async def test_there_is_an_end_to_listeners(clock: SetClock) -> None:
     stream.listen(KEYS)
 
 
-async def test_a_fault_costs_one_picture(monkeypatch: pytest.MonkeyPatch, clock: SetClock) -> None:
+async def test_a_fault_costs_one_snapshot(monkeypatch: pytest.MonkeyPatch, clock: SetClock) -> None:
     one = master()
 
     def faulty(now_ns: int) -> Any:
@@ -247,10 +250,10 @@ async def test_a_fault_costs_one_picture(monkeypatch: pytest.MonkeyPatch, clock:
             patch.setattr(one, "view", faulty)
             with pytest.raises(RuntimeError, match="once"):
                 clock.step()
-        assert (await next_heard(clock, listener))["units_live"] == 0
+        assert (await next_received(clock, listener))["units_live"] == 0
 
 
-async def test_what_costs_much_comes_rarely_but_with_each_heartbeat(
+async def test_costly_snapshots_are_rare_but_keep_the_heartbeat(
     monkeypatch: pytest.MonkeyPatch, clock: SetClock
 ) -> None:
     ticks = itertools.count(0, MS)
@@ -259,15 +262,15 @@ async def test_what_costs_much_comes_rarely_but_with_each_heartbeat(
     one = master(stale_after_s=60.0)
     unit = live(one, 1, 1)
     with Stream(one, clock).listen(KEYS) as listener:
-        first = await next_heard(clock, listener)
+        first = await next_received(clock, listener)
         unit.update(clock.now, [2], age_ns=MS)
-        second = await next_heard(clock, listener)
+        second = await next_received(clock, listener)
         assert second["voxels"] == [2]
         assert second["now_ns"] - first["now_ns"] == HEARTBEAT_NS
 
 
 async def test_by_default_its_clock_is_the_machine_s() -> None:
     with Stream(master()).listen(KEYS) as listener:
-        first, second = await heard(listener), await heard(listener)
+        first, second = await received(listener), await received(listener)
         assert second["now_ns"] - first["now_ns"] >= HEARTBEAT_NS - MS
         assert asyncio.get_running_loop().is_running()

@@ -28,7 +28,7 @@ def samples(metrics: Metrics) -> dict[tuple[str, frozenset[tuple[str, str]]], fl
     return {(name, labels): value for name, labels, value in found}
 
 
-def test_all_that_a_unit_is_told_by() -> None:
+def test_all_series_of_a_unit() -> None:
     one = master(with_robot=True)
     metrics = Metrics(one, Stream(one), Limits())
     unit = joined(one, 1, monotonic_ns())
@@ -77,7 +77,7 @@ def test_series_of_a_deleted_unit_vanish() -> None:
     assert left == {str(kept.initialized.id)}
 
 
-def test_what_a_unit_calls_itself_breaks_no_line() -> None:
+def test_names_reported_by_a_unit_are_escaped() -> None:
     one = master()
     FakeUnit(one, serial='a"} 7\\').initialize()
     assert any(("serial", 'a"} 7\\') in labels for _, labels in samples(Metrics(one, Stream(one), Limits())))
@@ -92,7 +92,7 @@ def test_refusals_by_status() -> None:
     assert refused == {"401": 1.0, "409": 2.0}
 
 
-def test_what_was_turned_away_and_what_is_open() -> None:
+def test_refused_and_open_connections() -> None:
     one, limits = master(), Limits()
     metrics = Metrics(one, Stream(one), limits)
     for _ in range(REQUESTS_BURST + 3):
@@ -109,7 +109,7 @@ def test_what_was_turned_away_and_what_is_open() -> None:
     assert found["cellwatch_connections", frozenset()] == CONNECTIONS_PER_ADDRESS
 
 
-def test_counting_is_cheap_and_so_is_a_full_house() -> None:
+def test_counting_and_a_scrape_of_all_units_are_cheap() -> None:
     one = master()
     metrics = Metrics(one, Stream(one), Limits())
     for number in range(MAX_UNITS):
@@ -120,5 +120,5 @@ def test_counting_is_cheap_and_so_is_a_full_house() -> None:
     assert (monotonic_ns() - began_ns) / rounds < 10 * NS_PER_US
     began_ns = monotonic_ns()
     metrics.exposition()
-    # A scrape stands between the updates of all units; once in some seconds.
+    # A scrape delays the updates of all units, once in some seconds.
     assert monotonic_ns() - began_ns < S // 10

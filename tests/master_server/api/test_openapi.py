@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the API says of itself is true: every example runs, every route says how it refuses."""
+"""The API description is true: every example works, and every route documents its refusals."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ NAMES = [f"{method.upper()} {path}" for method, path, _ in OPERATIONS]
 
 
 def bodies(operation: dict[str, Any]) -> list[tuple[str, Any]]:
-    """Media type and value of each example; one of nothing for a route without a body."""
+    """Return media type and value of each example; a single empty one for a route without a body."""
     content = operation.get("requestBody", {}).get("content", {})
     return [
         (kind, example["value"]) for kind, of in content.items() for example in of.get("examples", {}).values()
@@ -69,7 +69,7 @@ EXAMPLES = [
 
 def as_sent(kind: str, value: Any, registered: dict[str, Any]) -> dict[str, Any]:
     if kind == MEDIA_TYPE:
-        # Nobody can know the session beforehand.
+        # The session is not known beforehand.
         value = {**value, "keys": b64decode(value["keys"]), "session": registered["session"]}
         return {"content": msgpack.packb(value), "headers": MSGPACK}
     return {} if value is None else {"json": value}
@@ -87,7 +87,7 @@ async def fresh_desk(desk: Desk) -> AsyncIterator[Desk]:
 
 
 @pytest.mark.parametrize(("method", "path", "operation", "kind", "value"), EXAMPLES)
-async def test_every_example_runs_as_it_stands(
+async def test_every_example_works_as_it_is(
     method: str, path: str, operation: dict[str, Any], kind: str, value: Any, fresh_desk: Desk
 ) -> None:
     initialize = SCHEMA["paths"]["/initialize"]["post"]
@@ -105,13 +105,13 @@ async def test_every_example_runs_as_it_stands(
     sent = as_sent(kind, value, registered.json())
     response = await fresh_desk.call(method.upper(), path, token, params=query, **sent)
     assert str(response.status_code) in operation["responses"], response.text
-    assert response.is_success or refused_for_want_of_hardware(path, response), response.text
+    assert response.is_success or refused_without_hardware(path, response), response.text
     if path == "/update":
         decode_update_answer(response.content)
 
 
-def refused_for_want_of_hardware(path: str, response: httpx.Response) -> bool:
-    """Pictures come from a unit that runs, and there is none."""
+def refused_without_hardware(path: str, response: httpx.Response) -> bool:
+    """Return True for images, which need a running unit, and there is none."""
     return "/images/" in path and response.status_code in (409, 504)
 
 
@@ -134,7 +134,7 @@ def test_every_route_is_described(method: str, path: str, operation: dict[str, A
 
 
 @pytest.mark.parametrize(("method", "path", "operation"), OPERATIONS, ids=NAMES)
-async def test_routes_refuse_as_they_say(method: str, path: str, operation: dict[str, Any], fresh_desk: Desk) -> None:
+async def test_routes_refuse_as_described(method: str, path: str, operation: dict[str, Any], fresh_desk: Desk) -> None:
     for name, nonsense in (("unit_id", "7"), ("sha256", "0" * 64), ("name", "nothing"), ("kind", "depth")):
         path = path.replace(f"{{{name}}}", nonsense)
     for token in (None, "wrong-token-0123456789", UNIT, OPERATOR):
@@ -146,7 +146,7 @@ async def test_routes_refuse_as_they_say(method: str, path: str, operation: dict
 
 
 @pytest.mark.parametrize("page", ["/docs", "/redoc"])
-async def test_the_pages_ask_for_nothing_beyond_the_master(page: str, fresh_desk: Desk) -> None:
+async def test_the_pages_load_only_from_the_master(page: str, fresh_desk: Desk) -> None:
     text = (await fresh_desk.call("GET", page, None)).text
     loaded = re.findall(r"""(?:src|href)=["']([^"']+)["']|url: ["']([^"']+)["']""", text)
     assert loaded
@@ -165,7 +165,7 @@ async def test_the_document_follows_the_cell(fresh_desk: Desk) -> None:
     assert example == (await fresh_desk.call("GET", "/cell")).json()
 
 
-def test_updates_are_described_as_they_travel() -> None:
+def test_updates_are_described_as_on_the_wire() -> None:
     properties = SCHEMA["components"]["schemas"]["UpdateRequest"]["properties"]
     for name, model in ROWS.items():
         assert properties[name]["minItems"] == len(model.model_fields)

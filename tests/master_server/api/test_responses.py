@@ -29,7 +29,7 @@ NOW_NS = START_NS + S
 NOBODY = np.zeros((10, 10, 10), np.uint8)
 
 
-def test_shares_are_of_what_live_units_see() -> None:
+def test_shares_count_the_blocks_that_live_units_see() -> None:
     seen_by = np.array([[[0, 1, 2], [3, 4, 255]]], np.uint8)
     assert coverage_shares(seen_by) == pytest.approx([1 / 6, 1 / 6, 1 / 6, 3 / 6])
     assert coverage_shares(np.zeros((2, 2, 2), np.uint8)) == [1.0, 0.0, 0.0, 0.0]
@@ -55,7 +55,7 @@ def test_a_silent_unit_covers_nothing() -> None:
     assert (later["blocks"]["counts"], later["blocks"]["runs"]) == ([0], [1000])
 
 
-def test_json_and_msgpack_say_the_same() -> None:
+def test_json_and_msgpack_are_equivalent() -> None:
     one = master()
     joined(one).update(NOW_NS, [0, 411])
     fields = map_fields(one.view(NOW_NS), "centres", None, NOW_NS)
@@ -68,10 +68,10 @@ def test_json_and_msgpack_say_the_same() -> None:
 
 @pytest.mark.parametrize("form", ["indices", "centres", "keys"])
 @pytest.mark.parametrize("count", [0, 1, 15_000])
-def test_voxels_are_encoded_as_they_are_and_no_update_waits_for_them(form: Form, count: int) -> None:
+def test_voxels_are_encoded_fast_enough_for_updates(form: Form, count: int) -> None:
     lattice = Lattice((-1.0, 0.0, 0.5), 0.02, (150, 150, 150))
     keys = np.sort(np.random.default_rng(1).choice(lattice.cell_count, count, replace=False)).astype(np.uint32)
-    # As they may come out of a recording: not one after another in memory.
+    # As from a recording: not contiguous in memory.
     witnesses = np.arange(2 * count, dtype=np.uint8)[::2]
     view = MapView(lattice, 1, keys, witnesses, (), None, 1)
     indices = lattice.indices(keys)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests made up from the API's own description, right and wrong ones: no fault, and every answer as described."""
+"""Requests generated from the API's description, valid and invalid: no fault, and every answer as described."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ from tests.master_server.test_app import OPERATOR, UNIT, Desk
 
 CELL = Cell.load(DEMO_CELL)
 CASES, MANY_CASES = 10, 100
-"""For each operation, as many right ones and wrong ones."""
+"""Number of valid requests for each operation, and of invalid ones."""
 
 OF_UNITS = {"POST /initialize", "POST /update", "PUT /units/{unit_id}/images/{kind}"}
 
 WANT_OF_HARDWARE = {503, 504}
-"""Pictures come from a unit that runs, and there is none."""
+"""Images need a running unit, and there is none."""
 
 CHECKS = [
     checks.not_a_server_error,
@@ -54,7 +54,7 @@ CHECKS = [
 
 
 def fresh(folder: Path) -> Desk:
-    """A master of the demo cell that can record, and that takes more requests than any test has."""
+    """Return a master of the demo cell that can record, with a rate limit above that of any test."""
     limits = Limits()
     limits.requests = limits.wrong_tokens = RateLimit(1e9, 10**9)
     master = Master(CELL, Settings())
@@ -64,7 +64,7 @@ def fresh(folder: Path) -> Desk:
 
 @schemathesis.serializer(MEDIA_TYPE, "application/zip", "image/png")
 def as_bytes(_: Any, value: Any) -> Any:
-    """Bytes as they are; anything else as msgpack, what the description has in base64 as binary."""
+    """Return bytes unchanged; encode other values as msgpack, with base64 of the description as binary."""
     if isinstance(value, bytes):
         return value
     if isinstance(value, dict):
@@ -74,7 +74,7 @@ def as_bytes(_: Any, value: Any) -> Any:
     try:
         return msgpack.packb(value)
     except (OverflowError, ValueError):
-        # An integer that msgpack does not have.
+        # An integer that msgpack cannot encode.
         return b"\xc1"
 
 
@@ -118,7 +118,7 @@ def test_answers_are_as_described(
     registered = desk.call("POST", "/initialize", UNIT, json=example_of("POST /initialize"))
     answer = loop.run_until_complete(registered)
     assert answer.status_code == 200
-    # Nobody can know these beforehand.
+    # These are not known beforehand.
     known = {name: answer.json()[name] for name in ("id", "session")}
     sequence = itertools.count()
     right, wrong = (UNIT, OPERATOR) if label in OF_UNITS else (OPERATOR, UNIT)

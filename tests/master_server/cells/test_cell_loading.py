@@ -9,7 +9,7 @@ from master_server.cells import cell_loading, unpacking
 
 
 def test_the_process_that_unpacks_finds_our_packages_and_those_only(tmp_path: Path) -> None:
-    """By its path alone: `-S` leaves out what is installed, so an editable checkout cannot stand in for it."""
+    """Use its path alone: `-S` leaves out installed packages, so an editable checkout cannot replace it."""
     find = f"import importlib.util as u; print(u.find_spec({unpacking.__name__!r}).origin)"
     done = subprocess.run(
         [sys.executable, "-S", "-c", find],

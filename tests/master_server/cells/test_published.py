@@ -20,7 +20,7 @@ def cell_with(size: float, x: float, as_object: bool = False) -> Cell:
     return Cell("test", np.zeros(3), np.ones(3), static, objects)
 
 
-def test_what_is_published_is_the_cell() -> None:
+def test_the_published_cell_equals_the_cell() -> None:
     cell = cell_with(0.5, 0.5, as_object=True)
     published = PublishedCell.of(cell)
     assert (published.document, published.meshes) == cell.to_document()
@@ -41,18 +41,18 @@ def test_a_moved_object_changes_no_mesh() -> None:
 
 
 @pytest.mark.parametrize("as_object", [False, True])
-def test_cad_in_millimetres_is_told(as_object: bool, caplog: pytest.LogCaptureFixture) -> None:
+def test_cad_in_millimetres_is_reported(as_object: bool, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         PublishedCell.of(cell_with(8.0, 0.5, as_object))
     assert not caplog.records
-    # It reaches into the box, so it may be meant; whoever reads the log is told.
+    # It reaches into the box, so it may be intended; the log has a warning.
     with caplog.at_level(logging.WARNING):
         PublishedCell.of(cell_with(500.0, 0.5, as_object))
-    assert "its mesh is 500 m long in a box whose diagonal is 1.73 m" in caplog.text
+    assert "its mesh is 500 m long, but the diagonal of the box is 1.73 m" in caplog.text
     assert "set scale: 0.001" in caplog.text
     with pytest.raises(CellError, match=r"slab: .* set scale: 0.001 .*nothing of it lies in the box"):
         PublishedCell.of(cell_with(500.0, 700.0, as_object))
 
 
-def test_what_stands_beside_the_box_is_no_mistake() -> None:
+def test_a_mesh_beside_the_box_is_valid() -> None:
     assert PublishedCell.of(cell_with(0.5, 5.0)).meshes

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process that reads a cell's folder out of a zip, and what it refuses."""
+"""The process that reads a cell's folder from a zip, and its refusals."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def zipped(path: Path, files: dict[str, str | bytes]) -> Path:
 
 
 def read(archive: Path, folder: Path) -> tuple[int, str]:
-    """What the process says about an archive."""
+    """Run the process on an archive; return its exit code and output."""
     folder.mkdir()
     done = subprocess.run(
         [sys.executable, "-m", "master_server.cells.unpacking", str(archive), str(folder)],
@@ -41,7 +41,7 @@ def read(archive: Path, folder: Path) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize("top", ["", "mycell/"])
-def test_the_demo_cell_comes_out_as_it_went_in(tmp_path: Path, top: str) -> None:
+def test_the_demo_cell_is_unchanged_by_unpacking(tmp_path: Path, top: str) -> None:
     files: dict[str, str | bytes] = {f"{top}{file.name}": file.read_bytes() for file in DEMO.glob("*.*")}
     out = tmp_path / "out"
     assert read(zipped(tmp_path / "cell.zip", files), out) == (0, "")
@@ -68,7 +68,7 @@ def test_the_demo_cell_comes_out_as_it_went_in(tmp_path: Path, top: str) -> None
         ({"a\\..\\cell.yaml": CELL}, "got one that leaves it"),
     ],
 )
-def test_what_is_no_cell_is_one_sentence(tmp_path: Path, files: dict[str, str | bytes], said: str) -> None:
+def test_an_invalid_cell_is_reported_in_one_sentence(tmp_path: Path, files: dict[str, str | bytes], said: str) -> None:
     (tmp_path / "secret.stl").write_bytes((DEMO / "tray.stl").read_bytes())
     code, words = read(zipped(tmp_path / "cell.zip", files), tmp_path / "out")
     assert code == 1
@@ -95,7 +95,7 @@ def test_links_are_refused(tmp_path: Path) -> None:
         ("MAX_UNPACKED_BYTES", "expected at most 0 MiB unpacked"),
     ],
 )
-def test_all_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bound: str, words: str) -> None:
+def test_sizes_and_counts_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bound: str, words: str) -> None:
     archive = zipped(tmp_path / "cell.zip", {"cell.yaml": CELL, "more": b"0" * 100})
     unpacking.unpack(archive, tmp_path / "fits")
     monkeypatch.setattr(unpacking, bound, 1)
@@ -104,7 +104,7 @@ def test_all_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bound: 
     assert not (tmp_path / "out").exists()
 
 
-def test_a_damaged_zip_is_one_sentence(tmp_path: Path) -> None:
+def test_a_damaged_zip_is_reported_in_one_sentence(tmp_path: Path) -> None:
     archive = zipped(tmp_path / "cell.zip", {"cell.yaml": CELL, "more": bytes(range(256)) * 10})
     data = archive.read_bytes()
     for damaged in (data[:100], b"", data[:50] + b"\xff" * 30 + data[80:]):

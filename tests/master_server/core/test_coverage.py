@@ -36,7 +36,7 @@ def test_what_units_see_is_counted() -> None:
     assert np.array_equal(coverage.seen_by([1, 3, 99]), expected)
 
 
-def test_nothing_is_seen_by_nobody() -> None:
+def test_without_units_all_is_unseen() -> None:
     coverage = Coverage(BLOCKS)
     coverage.report(1, report(noise(1)))
     assert not coverage.seen_by([]).any()
@@ -46,7 +46,7 @@ def test_nothing_is_seen_by_nobody() -> None:
     assert not coverage.seen_by([1]).any()
 
 
-def test_how_far_a_unit_looks_is_measured_along_its_axis() -> None:
+def test_range_is_measured_along_the_camera_axis() -> None:
     coverage = Coverage(BLOCKS)
     from_below, sideways = np.eye(4), look_at(np.array([-1.0, 0.2, 0.15]), np.array([0.0, 0.2, 0.15]))
     assert coverage.range_m(1, matrix_of(from_below)) is None
@@ -59,7 +59,7 @@ def test_how_far_a_unit_looks_is_measured_along_its_axis() -> None:
     assert coverage.range_m(1, matrix_of(sideways)) == pytest.approx(1.35)
 
 
-def test_a_larger_block_stands_for_all_that_it_holds() -> None:
+def test_a_larger_block_covers_all_blocks_inside_it() -> None:
     coverage = Coverage(BLOCKS)
     coarse = np.zeros((3, 2, 2), bool)
     coarse[2, 1, 0] = True

@@ -28,6 +28,7 @@ from shared.messages import (
     PoseOrigin,
     Progress,
     UnitRow,
+    Verb,
     Versions,
 )
 from shared.settings import Settings
@@ -36,7 +37,7 @@ from tests.master_server.fakes import AT_ORIGIN, GOOD, MS, START_NS, FakeUnit, S
 
 NOW_NS = START_NS + S
 LATER_NS = NOW_NS + 60 * S
-"""Whoever reported at `NOW_NS` and never since is silent by then."""
+"""A unit that reported at `NOW_NS` and never since is silent by then."""
 
 
 def shown(one: Master, now_ns: int = NOW_NS) -> dict[int, int]:
@@ -50,7 +51,7 @@ def state(one: Master, unit: FakeUnit, now_ns: int = NOW_NS) -> tuple[str, str]:
 
 
 def live(one: Master, number: int = 1, *keys: int) -> FakeUnit:
-    """A unit that has just reported, and sees everything."""
+    """Return a unit that has just reported and sees everything."""
     unit = joined(one, number)
     unit.update(NOW_NS, keys, seen=sees_all(one))
     assert state(one, unit) == ("live", "")
@@ -70,7 +71,7 @@ def test_an_ip_has_one_slot() -> None:
     assert len(one.units(NOW_NS)) == 2
 
 
-def test_a_restarted_unit_keeps_its_pose_and_says_nothing_until_its_first_update() -> None:
+def test_a_restarted_unit_keeps_its_pose_and_reports_from_its_first_update() -> None:
     one = master()
     live(one, 1, 5)
     unit = FakeUnit(one, serial="S1")
@@ -102,7 +103,7 @@ def test_a_camera_at_a_new_ip_retires_its_old_slot() -> None:
     assert shown(one) == {}
 
 
-def test_a_camera_whose_address_another_took_is_missed_until_it_is_back() -> None:
+def test_a_camera_that_lost_its_address_is_missing_until_it_returns() -> None:
     one = master()
     live(one, 1, 5)
     live(one, 2, 6)
@@ -148,7 +149,7 @@ def test_two_cameras_of_one_serial_do_not_evict_each_other() -> None:
     assert shown(one, NOW_NS + 200 * MS) == {6: 1}
 
 
-def test_there_is_an_end_to_slots() -> None:
+def test_the_number_of_slots_is_bounded() -> None:
     one = master()
     for number in range(MAX_UNITS):
         joined(one, number)
@@ -176,7 +177,7 @@ def test_another_contract_is_refused() -> None:
         ({"sequence": 1}, "10.0.0.1", 409),
     ],
 )
-def test_updates_that_are_not_this_units_or_not_new(changes: dict[str, Any], ip: str, status: int) -> None:
+def test_foreign_and_old_updates_are_refused(changes: dict[str, Any], ip: str, status: int) -> None:
     one = master()
     unit = live(one, 1, 5)
     request = unit.request(NOW_NS, [6], **changes)
@@ -214,7 +215,7 @@ def test_live_units_are_united() -> None:
     assert view.oldest_view_age_s == pytest.approx(0.03)
 
 
-def test_a_silent_unit_is_stale_its_voxels_go_and_the_map_is_not_complete() -> None:
+def test_a_silent_unit_is_stale_and_makes_the_map_incomplete() -> None:
     one = master(stale_after_s=0.4)
     live(one, 1, 1, 2)
     second = live(one, 2, 2, 3)
@@ -229,7 +230,7 @@ def test_a_silent_unit_is_stale_its_voxels_go_and_the_map_is_not_complete() -> N
     assert shown(one, later_ns) == {1: 1, 2: 2, 3: 1}
 
 
-def test_age_is_of_the_capture_whatever_the_units_clock_says() -> None:
+def test_age_counts_from_the_capture_at_any_offset_of_the_clock() -> None:
     for offset_ns in (0, 10**15, -900 * S):
         one = master()
         unit = FakeUnit(one, offset_ns=offset_ns)
@@ -255,7 +256,7 @@ def test_a_delay_before_arrival_counts() -> None:
 
 
 @pytest.mark.parametrize("jump_ns", [3600 * S, -3600 * S])
-def test_a_units_clock_that_jumps_is_never_believed_and_soon_understood(jump_ns: int) -> None:
+def test_a_jump_of_a_units_clock_is_detected_and_recovered(jump_ns: int) -> None:
     one = master()
     unit = live(one, 1, 1)
     unit.offset_ns -= jump_ns
@@ -273,7 +274,7 @@ def test_without_an_exchange_a_units_age_is_not_known() -> None:
     assert state(one, unit) == ("stale", "its clock is not known yet")
 
 
-def test_a_clock_that_is_known_too_badly_is_not_enough() -> None:
+def test_a_clock_of_too_large_uncertainty_is_not_trusted() -> None:
     one = master()
     unit = joined(one)
     unit.update(NOW_NS, [1], exchange=Exchange(0, NOW_NS, NOW_NS, 4 * S))
@@ -284,7 +285,7 @@ def cause(one: Master, unit: FakeUnit, now_ns: int = NOW_NS) -> tuple[str, dict[
     row = next(row for row in one.units(now_ns) if row.id == unit.initialized.id)
     assert row.cause is not None
     assert row.cause.sentence == row.reason
-    # As the window is told.
+    # As the viewer receives it.
     assert UnitRow.model_validate(row.model_dump(), strict=True) == row
     return row.cause.code, row.cause.numbers
 
@@ -326,7 +327,7 @@ def test_a_state_has_a_code_and_numbers(changes: dict[str, Any], code: str, numb
     assert causes.get(code, {"unit": 1})["unit"] == 1
 
 
-def test_a_unit_that_is_silent_is_that_whatever_it_said() -> None:
+def test_a_silent_unit_is_silent_despite_earlier_trouble() -> None:
     one = master()
     unit = joined(one)
     assert cause(one, unit)[0] == "no_update"
@@ -351,7 +352,7 @@ def test_a_unit_without_a_frame_says_so() -> None:
         (GOOD.model_copy(update={"trouble": "learning"}), "blind", "learning"),
     ],
 )
-def test_a_view_that_cannot_be_trusted_gives_nothing(health: Health, expected: str, words: str) -> None:
+def test_an_untrusted_view_gives_no_voxels(health: Health, expected: str, words: str) -> None:
     one = master()
     unit = live(one, 1, 1)
     unit.update(NOW_NS, [1], health=health)
@@ -396,7 +397,7 @@ REPORTS = st.lists(
 
 @settings(deadline=None)
 @given(REPORTS)
-def test_the_map_is_what_the_newest_fresh_reports_say(history: list[tuple[int, set[int], int, bool]]) -> None:
+def test_the_map_is_the_union_of_the_newest_fresh_reports(history: list[tuple[int, set[int], int, bool]]) -> None:
     one = master(stale_after_s=0.5)
     units = {number: joined(one, number) for number in (1, 2, 3)}
     reports: dict[int, tuple[int, set[int]]] = {}
@@ -423,7 +424,7 @@ def test_an_empty_master_is_not_complete() -> None:
     assert view.oldest_view_age_s is None
 
 
-def test_a_unit_that_has_not_reported_what_it_sees_is_not_complete() -> None:
+def test_a_unit_without_a_seen_report_makes_the_map_incomplete() -> None:
     one = master()
     unit = joined(one)
     unit.update(NOW_NS, [1])
@@ -437,14 +438,14 @@ def test_a_unit_that_has_not_reported_what_it_sees_is_not_complete() -> None:
     assert not one.view(NOW_NS).complete
 
 
-def test_an_uncalibrated_unit_is_not_complete() -> None:
+def test_an_uncalibrated_unit_makes_the_map_incomplete() -> None:
     one = master()
     live(one)
     FakeUnit(one, ip="10.0.0.2", serial="B").initialize(pose=None)
     assert one.view(NOW_NS).reasons == ("unit 2 (10.0.0.2) is uncalibrated: its pose is not known yet",)
 
 
-def test_a_robot_that_does_not_report_is_not_complete() -> None:
+def test_a_silent_robot_makes_the_map_incomplete() -> None:
     one = master(with_robot=True)
     live(one)
     assert one.view(NOW_NS).reasons == ("the robot has not reported its joints yet",)
@@ -454,10 +455,10 @@ def test_a_robot_that_does_not_report_is_not_complete() -> None:
     assert not one.view(NOW_NS + 101 * MS).complete
 
 
-# ---------------------------------------------------------------------- what changes while it runs
+# ---------------------------------------------------------------------- changes at run time
 
 
-def test_a_new_lattice_drops_all_voxels_and_takes_none_of_the_old() -> None:
+def test_a_new_lattice_drops_all_voxels_and_refuses_old_ones() -> None:
     one = master()
     first, second = live(one, 1, 1), live(one, 2, 2)
     one.change_settings({"voxel_size_m": 0.1})
@@ -472,7 +473,7 @@ def test_a_new_lattice_drops_all_voxels_and_takes_none_of_the_old() -> None:
     assert answer.lattice.shape == (10, 20, 5)
     assert shown(one, NOW_NS + MS) == {}
     assert state(one, first, NOW_NS + MS) == ("stale", "it does not work on the current lattice yet")
-    # What the old lattice allowed need not fit the new one, and is no error.
+    # Keys of the old lattice may exceed the new one, which is no error.
     second.update(NOW_NS + MS, [7999], versions=stale)
     first.update(NOW_NS + 2 * MS, [999], seen=sees_all(one))
     assert shown(one, NOW_NS + 2 * MS) == {999: 1}
@@ -480,7 +481,7 @@ def test_a_new_lattice_drops_all_voxels_and_takes_none_of_the_old() -> None:
         first.update(NOW_NS + 3 * MS, [1000])
 
 
-def test_other_settings_leave_the_map_alone() -> None:
+def test_other_settings_do_not_change_the_map() -> None:
     one = master()
     unit = live(one, 1, 1)
     one.change_settings({"occupancy_threshold": 1.25})
@@ -543,7 +544,7 @@ def test_settings_that_are_refused_change_nothing(monkeypatch: pytest.MonkeyPatc
     assert shown(one) == {5: 1}
 
 
-def test_other_blocks_void_what_was_seen() -> None:
+def test_another_block_size_drops_the_seen_reports() -> None:
     one = master()
     unit = live(one)
     old = sees_all(one)
@@ -555,7 +556,7 @@ def test_other_blocks_void_what_was_seen() -> None:
     assert one.view(NOW_NS).complete
 
 
-def test_a_new_pose_voids_what_was_reported_with_the_old_one() -> None:
+def test_a_new_pose_drops_reports_made_with_the_old_one() -> None:
     one = master()
     unit = live(one, 1, 1)
     moved = (*AT_ORIGIN[:2], (0.0, 0.0, 1.0, 0.3), AT_ORIGIN[3])
@@ -570,7 +571,7 @@ def test_a_new_pose_voids_what_was_reported_with_the_old_one() -> None:
 
 
 @pytest.mark.parametrize(("unit_id", "ip", "status"), [(9, None, 404), (1, "10.0.0.2", 403)])
-def test_a_unit_tells_only_its_own_pose(unit_id: int, ip: str | None, status: int) -> None:
+def test_a_unit_sets_only_its_own_pose(unit_id: int, ip: str | None, status: int) -> None:
     one = master()
     live(one)
     with pytest.raises(Refusal) as caught:
@@ -581,7 +582,7 @@ def test_a_unit_tells_only_its_own_pose(unit_id: int, ip: str | None, status: in
 def test_commands_are_repeated_until_they_are_done() -> None:
     one = master()
     unit = live(one)
-    command = one.ask(unit.initialized.id, "learn_background", NOW_NS)
+    command = one.send_command(unit.initialized.id, "learn_background", NOW_NS)
     assert unit.update(NOW_NS).commands == (command,)
     assert unit.update(NOW_NS).commands == (command,)
     (row,) = one.units(NOW_NS)
@@ -592,14 +593,14 @@ def test_commands_are_repeated_until_they_are_done() -> None:
     assert row.last_command == CommandRow(id=command.id, verb="learn_background", outcome="done", code="done")
 
 
-def test_who_asks_changes_and_logs_nothing(caplog: pytest.LogCaptureFixture) -> None:
+def test_reads_change_and_log_nothing(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
     one = master()
     unit = live(one, 1, 5)
-    command = one.ask(unit.initialized.id, "calibrate", NOW_NS)
+    command = one.send_command(unit.initialized.id, "calibrate", NOW_NS)
     slot = one.registry.get(unit.initialized.id)
     one.tick(NOW_NS)
-    before = (one.map.revision, slot.told_state, slot.commands, slot.last_command, one.coverage.has(slot.id))
+    before = (one.map.revision, slot.logged_state, slot.commands, slot.last_command, one.coverage.has(slot.id))
     caplog.clear()
     for now_ns, expected in ((NOW_NS, {5: 1}), (NOW_NS + 3600 * S, {}), (NOW_NS, {5: 1})):
         view = one.view(now_ns)
@@ -617,11 +618,11 @@ def test_who_asks_changes_and_logs_nothing(caplog: pytest.LogCaptureFixture) -> 
         assert (row.last_command.outcome is None) == bool(expected)
         one.next_change_ns(now_ns)
         one.robot_answer(None, now_ns)
-    assert before == (one.map.revision, slot.told_state, (command,), slot.last_command, one.coverage.has(slot.id))
+    assert before == (one.map.revision, slot.logged_state, (command,), slot.last_command, one.coverage.has(slot.id))
     assert before[2] == (command,)
     assert not caplog.records
     one.tick(NOW_NS + 3600 * S)
-    assert slot.told_state == "stale"
+    assert slot.logged_state == "stale"
     assert slot.commands == ()
     assert {record.levelname for record in caplog.records} == {"WARNING", "INFO"}
 
@@ -630,26 +631,26 @@ def test_commands_are_bounded() -> None:
     one = master()
     unit = live(one)
     for _ in range(MAX_COMMANDS):
-        one.ask(unit.initialized.id, "drop_background", NOW_NS)
+        one.send_command(unit.initialized.id, "drop_background", NOW_NS)
     with pytest.raises(Refusal, match="wait for it already"):
-        one.ask(unit.initialized.id, "drop_background", NOW_NS)
+        one.send_command(unit.initialized.id, "drop_background", NOW_NS)
 
 
 def test_commands_that_are_never_answered_expire() -> None:
     one = master()
     unit = live(one)
     for _ in range(MAX_COMMANDS):
-        one.ask(unit.initialized.id, "calibrate", NOW_NS)
+        one.send_command(unit.initialized.id, "calibrate", NOW_NS)
     later_ns = NOW_NS + round(COMMAND_EXPIRES_S * S)
     assert len(unit.update(later_ns - MS).commands) == MAX_COMMANDS
     (row,) = one.units(later_ns)
     assert row.last_command is not None
     assert row.last_command.outcome == "the unit did not answer within 600 s"
     assert unit.update(later_ns).commands == ()
-    assert one.ask(unit.initialized.id, "calibrate", later_ns).verb == "calibrate"
+    assert one.send_command(unit.initialized.id, "calibrate", later_ns).verb == "calibrate"
 
 
-def test_a_unit_gets_the_joints_that_it_lacks() -> None:
+def test_a_unit_receives_only_new_joints() -> None:
     one = master(with_robot=True)
     unit = joined(one)
     for step in range(5):
@@ -661,13 +662,13 @@ def test_a_unit_gets_the_joints_that_it_lacks() -> None:
     assert len(unit.update(NOW_NS + 53 * MS).joints) == 1
 
 
-# ---------------------------------------------------------------------- whose pose counts
+# ---------------------------------------------------------------------- which pose counts
 
 
-def tell(
+def register(
     one: Master, pose: Matrix | None, ip: str = "10.0.0.1", serial: str = "S1", now_ns: int = LATER_NS
 ) -> FakeUnit:
-    """A unit that registers with the pose that its configuration has."""
+    """Register a unit with the pose of its configuration."""
     unit = FakeUnit(one, ip=ip, serial=serial)
     request = unit.introduction(now_ns - MS).model_copy(update={"T_world_camera": pose})
     unit.initialized = one.initialize(request, ip, now_ns)
@@ -683,25 +684,25 @@ def shifted(x_m: float) -> Matrix:
 
 def test_a_configured_pose_that_changed_replaces_a_configured_one() -> None:
     one = master()
-    first = tell(one, shifted(0.1))
+    first = register(one, shifted(0.1))
     assert first.initialized.T_world_camera == shifted(0.1)
-    again = tell(one, shifted(0.1), now_ns=LATER_NS + S)
+    again = register(one, shifted(0.1), now_ns=LATER_NS + S)
     assert again.initialized.versions.pose == first.initialized.versions.pose
-    moved = tell(one, shifted(0.2), now_ns=LATER_NS + 2 * S)
+    moved = register(one, shifted(0.2), now_ns=LATER_NS + 2 * S)
     assert moved.initialized.T_world_camera == shifted(0.2)
     assert moved.initialized.versions.pose == first.initialized.versions.pose + 1
     row = one.units(LATER_NS + 2 * S)[0]
     assert (row.pose_origin, row.reason) == ("configured", "")
-    # Without one in its configuration it keeps what it had.
-    assert tell(one, None, now_ns=LATER_NS + 3 * S).initialized.T_world_camera == shifted(0.2)
+    # Without a configured pose it keeps the old one.
+    assert register(one, None, now_ns=LATER_NS + 3 * S).initialized.T_world_camera == shifted(0.2)
 
 
 @pytest.mark.parametrize("origin", ["operator", "board", "refined"])
 def test_a_configured_pose_never_replaces_a_better_one_and_the_row_says_so(origin: PoseOrigin) -> None:
     one = master()
-    tell(one, shifted(0.1))
+    register(one, shifted(0.1))
     one.set_pose(1, shifted(0.5), origin, None)
-    unit = tell(one, shifted(0.2))
+    unit = register(one, shifted(0.2))
     assert unit.initialized.T_world_camera == shifted(0.5)
     row = one.units(LATER_NS + MS)[0]
     assert (row.state, row.pose_origin) == ("live", origin)
@@ -712,15 +713,15 @@ def test_a_configured_pose_never_replaces_a_better_one_and_the_row_says_so(origi
     assert one.registry.get(1).warning == ""
 
 
-def test_a_configured_pose_that_was_refined_is_no_reason_to_warn() -> None:
+def test_a_refined_configured_pose_gives_no_warning() -> None:
     one = master()
-    tell(one, shifted(0.2))
+    register(one, shifted(0.2))
     one.set_pose(1, shifted(0.25), "refined", None)
-    assert tell(one, shifted(0.2)).initialized.T_world_camera == shifted(0.25)
+    assert register(one, shifted(0.2)).initialized.T_world_camera == shifted(0.25)
     assert one.units(LATER_NS + MS)[0].reason == ""
 
 
-def test_two_cameras_behind_one_address_do_not_take_turns() -> None:
+def test_two_cameras_behind_one_address_do_not_alternate() -> None:
     one = master()
     first = live(one, 1, 5)
     other = FakeUnit(one, ip="10.0.0.1", serial="B")
@@ -732,7 +733,7 @@ def test_two_cameras_behind_one_address_do_not_take_turns() -> None:
     assert one.units(NOW_NS)[0].serial == "S1"
 
 
-def test_a_row_tells_what_the_camera_is_and_how_far_it_looks() -> None:
+def test_a_row_has_the_camera_model_and_its_range() -> None:
     one = master()
     unit = joined(one, 1)
     (row,) = one.units(NOW_NS)
@@ -740,3 +741,15 @@ def test_a_row_tells_what_the_camera_is_and_how_far_it_looks() -> None:
     unit.update(NOW_NS, [5], seen=sees_all(one))
     # The highest block of a cell of half a metre, from its floor.
     assert one.units(NOW_NS)[0].range_m == 0.45
+
+
+@pytest.mark.parametrize("verb", ["learn_background", "refine", "calibrate", "image"])
+def test_a_unit_that_does_not_understand_its_master_is_sent_no_command(verb: Verb) -> None:
+    one = master()
+    unit = joined(one)
+    unit.update(NOW_NS, health=Health(trouble="update this unit: it speaks contract 5.0", trouble_code="contract"))
+    with pytest.raises(Refusal, match="takes no commands of this master: update this unit") as refused:
+        one.registry.send_command(one.registry.get(unit.initialized.id), verb, NOW_NS)
+    assert refused.value.status == 409
+    unit.update(NOW_NS)
+    assert one.registry.send_command(one.registry.get(unit.initialized.id), verb, NOW_NS).verb == verb

@@ -63,7 +63,7 @@ def test_a_crowded_lattice_and_an_empty_one_are_united_alike() -> None:
         assert content(merged) == Counter([*range(0, 3 * reported, 3), *range(0, 2 * reported, 2)])
 
 
-def test_who_reports_what_is_known() -> None:
+def test_the_reports_of_each_unit_are_available() -> None:
     merged = MergedMap(LATTICE)
     merged.replace(1, keys(1, 2))
     merged.replace(2, keys(2))
@@ -107,7 +107,7 @@ REPORT = st.one_of(st.none(), st.sets(st.integers(0, LATTICE.cell_count - 1), ma
 
 
 @given(st.lists(st.tuples(st.integers(1, 4), REPORT), max_size=40))
-def test_any_history_gives_what_counting_anew_gives(history: list[tuple[int, set[int] | None]]) -> None:
+def test_any_history_equals_a_recount(history: list[tuple[int, set[int] | None]]) -> None:
     merged = MergedMap(LATTICE)
     reports: dict[int, set[int]] = {}
     for unit_id, report in history:
@@ -121,7 +121,7 @@ def test_any_history_gives_what_counting_anew_gives(history: list[tuple[int, set
 
 
 class MergeMachine(RuleBasedStateMachine):
-    """The merged map beside a slow twin of plain sets."""
+    """Compare the merged map with a slow model of plain sets."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -150,13 +150,13 @@ class MergeMachine(RuleBasedStateMachine):
         self.revision += self.twin.pop(unit, None) is not None
 
     @rule(units=st.sets(UNITS))
-    def ask_of_some(self, units: set[int]) -> None:
+    def union_of_some(self, units: set[int]) -> None:
         keys, witnesses = self.map.voxels(sorted(units))
         counts = Counter(key for unit in units for key in self.twin.get(unit, ()))
         assert dict(zip(keys.tolist(), witnesses.tolist(), strict=True)) == counts
 
     @invariant()
-    def says_what_the_sets_say(self) -> None:
+    def equals_the_sets(self) -> None:
         keys, witnesses = self.map.voxels()
         counts = Counter(key for reported in self.twin.values() for key in reported)
         assert keys.tolist() == sorted(counts)

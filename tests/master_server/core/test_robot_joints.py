@@ -19,7 +19,7 @@ def put(robot: RobotJoints, at_ns: int, value: float = 0.0) -> None:
     robot.put(JointsRequest(positions=(value, value), at_ns=at_ns), at_ns)
 
 
-def test_without_a_time_joints_are_of_their_arrival() -> None:
+def test_joints_without_a_time_get_the_time_of_arrival() -> None:
     robot = RobotJoints(NAMES)
     assert robot.put(JointsRequest(positions=(1.0, 2.0)), 77).at_ns == 77
 
@@ -58,11 +58,11 @@ def test_refusals(request_: JointsRequest, status: int, words: str) -> None:
 
 
 def test_a_cell_without_a_robot_takes_no_joints() -> None:
-    with pytest.raises(Refusal, match="has none"):
+    with pytest.raises(Refusal, match="no robot"):
         RobotJoints(None).put(JointsRequest(positions=()), S)
 
 
-def test_a_unit_gets_what_it_lacks_thinned_with_the_newest() -> None:
+def test_new_samples_are_thinned_and_include_the_newest() -> None:
     robot = RobotJoints(NAMES)
     for step in range(101):
         put(robot, S + step * 2 * MS, float(step))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What time alone changes is noticed by the clock, and by nobody who only asks."""
+"""Changes by time alone: the clock notices them, reads do not."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_tick_comes_well_within_the_shortest_age_that_is_trusted() -> None:
     assert shortest * NS_PER_S >= 2 * TICK_NS
 
 
-def test_states_are_logged_at_their_time_though_nobody_asks(caplog: pytest.LogCaptureFixture) -> None:
+def test_states_are_logged_in_time_without_requests(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     clock, one = SetClock(), master(stale_after_s=0.05)
     joined(one).update(START_NS, seen=sees_all(one), age_ns=MS)
@@ -50,7 +50,7 @@ def test_a_command_that_is_not_answered_ends_by_itself(caplog: pytest.LogCapture
     caplog.set_level(logging.INFO)
     clock, one = SetClock(), master()
     unit = joined(one)
-    one.ask(unit.initialized.id, "calibrate", START_NS)
+    one.send_command(unit.initialized.id, "calibrate", START_NS)
     clock.now = START_NS + round(COMMAND_EXPIRES_S * S) - MS
     Ticker(one, clock).start()
     assert one.registry.get(unit.initialized.id).commands

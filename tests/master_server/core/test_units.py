@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The registry beside a slow twin, through any history of units that come, go, change their places and restart."""
+"""Compare the registry with a slow model, in any history of units that come, go, change addresses and restart."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shared.messages import CONTRACT_MINOR, CONTRACT_VERSION, InitializeRequest
 from tests.master_server.fakes import AT_ORIGIN, START_NS, S
 
 MAX_UNITS = 4
-"""Instead of 64, so that it is reached."""
+"""Instead of 64, so that tests reach it."""
 
 STALE_AFTER_S = 1.0
 IPS = [f"10.0.0.{number}" for number in range(1, 8)]
@@ -28,7 +28,7 @@ SERIALS = "ABCDEFG"
 
 @dataclass
 class Known:
-    """What the twin knows of the slot of one IP."""
+    """The model's state of the slot of one IP."""
 
     id: int
     serial: str
@@ -82,10 +82,10 @@ class RegistryMachine(RuleBasedStateMachine):
             if here is None or here.serial == serial:
                 del self.twin[there]
             else:
-                # The camera that was here is expected where the other one came from.
+                # The earlier camera is expected in the slot that the new one left.
                 self.twin[there] = Known(self.twin[there].id, here.serial)
         if here is None:
-            # An id is never given again, or a unit that was forgotten would report into another's slot.
+            # An id is never reused: a deleted unit would otherwise report into another's slot.
             assert slot.id > max(self.given, default=0)
             self.given.add(slot.id)
             self.twin[ip] = Known(slot.id, serial, has_pose=slot.T_world_camera is not None)
@@ -131,7 +131,7 @@ class RegistryMachine(RuleBasedStateMachine):
             known.updated_at_ns = None
 
     @invariant()
-    def knows_what_the_twin_knows(self) -> None:
+    def equals_the_model(self) -> None:
         assert {slot.ip: (slot.id, slot.serial) for slot in self.registry} == {
             ip: (known.id, known.serial) for ip, known in self.twin.items()
         }
@@ -141,7 +141,7 @@ class RegistryMachine(RuleBasedStateMachine):
         assert len(self.registry) <= MAX_UNITS
         assert len({slot.serial for slot in self.registry}) == len(self.registry)
         for slot in self.registry:
-            with pytest.raises(Refusal, match="not the unit of") as caught:
+            with pytest.raises(Refusal, match="another IP") as caught:
                 self.registry.own(slot.id, "10.0.9.9")
             assert caught.value.status == 403
         for gone in self.given - {known.id for known in self.twin.values()}:
@@ -150,7 +150,7 @@ class RegistryMachine(RuleBasedStateMachine):
             assert caught.value.status == 404
 
     @invariant()
-    def all_of_it_is_stored(self) -> None:
+    def everything_is_stored(self) -> None:
         assert {unit.id: unit for unit in self.store.load().units} == {slot.id: slot.record for slot in self.registry}
 
 

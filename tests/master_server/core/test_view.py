@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map beside a slow twin: what is answered for a time depends on what was reported, and on nobody who asked."""
+"""Compare the map with a slow model: the answer for a time depends on the reports only, not on earlier reads."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ViewMachine(RuleBasedStateMachine):
         self.master.store.close()
 
     def expected(self, now_ns: int) -> dict[int, int]:
-        """The voxels of units whose last frame is young enough, and how many of these report each."""
+        """Return the voxels of units whose last frame is fresh, and the number of these that report each."""
         return Counter(
             key
             for keys, captured_ns in self.reports.values()
@@ -76,8 +76,8 @@ class ViewMachine(RuleBasedStateMachine):
         self.master.tick(self.now_ns)
 
     @invariant()
-    def says_what_the_twin_says_of_any_time(self) -> None:
-        told = {slot.id: slot.told_state for slot in self.master.registry}
+    def equals_the_model_at_any_time(self) -> None:
+        told = {slot.id: slot.logged_state for slot in self.master.registry}
         for now_ns in (self.now_ns, self.now_ns + round(0.5 * S), self.now_ns + 60 * S, self.now_ns):
             view = self.master.view(now_ns)
             assert dict(zip(view.keys.tolist(), view.witnesses.tolist(), strict=True)) == self.expected(now_ns)
@@ -89,7 +89,7 @@ class ViewMachine(RuleBasedStateMachine):
             assert (view.units_live, sorted(view.reports)) == (len(live), sorted(live))
             assert self.master.seen_by(now_ns).max() == len(live)
             assert view.complete == (0 < len(live) == len(self.units))
-        assert told == {slot.id: slot.told_state for slot in self.master.registry}
+        assert told == {slot.id: slot.logged_state for slot in self.master.registry}
 
 
 TestViewMachine = ViewMachine.TestCase

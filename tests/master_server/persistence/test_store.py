@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What outlives the master: files that are whole, foreign, damaged or full, and masters that follow one another."""
+"""The stored state: files that are whole, foreign, damaged or full, and restarts of the master."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def with_box(size_m: float = 0.2) -> Cell:
 
 
 def fill(store: Store) -> None:
-    """Have the disk full for this store."""
+    """Fill the disk for this store."""
     pages = store._connection.execute("PRAGMA page_count").fetchone()[0]
     store._connection.execute(f"PRAGMA max_page_count = {pages}")
     free = store._connection.execute("PRAGMA freelist_count").fetchone()[0]
@@ -67,10 +67,10 @@ def make_writes_work(store: Store) -> None:
     store._connection.execute("PRAGMA query_only = OFF")
 
 
-# ---------------------------------------------------------------------- one master after another
+# ---------------------------------------------------------------------- restarts
 
 
-def test_all_that_was_acknowledged_is_there_in_the_next_master(path: Path) -> None:
+def test_acknowledged_changes_survive_a_restart(path: Path) -> None:
     store = Store.open(path)
     one = Master(with_box(), Settings(), store)
     joined(one, 1)
@@ -96,7 +96,7 @@ def test_all_that_was_acknowledged_is_there_in_the_next_master(path: Path) -> No
     ]
     assert [row.pose_quality.uncertainty_mm for row in rows] == [None, 1.5]
     assert [row.intrinsics for row in rows] == [Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)] * 2
-    # What was seen before is not seen now.
+    # Earlier seen reports do not count now.
     assert [row.range_m for row in rows] == [None, None]
     assert not two.view(NOW_NS).complete
     # An id is never given twice.
@@ -118,7 +118,7 @@ def test_a_map_is_complete_again_once_every_unit_has_reported_or_is_deleted() ->
     assert two.view(NOW_NS + MS).complete
 
 
-def test_a_session_of_the_master_before_is_over() -> None:
+def test_a_session_of_an_earlier_master_is_expired() -> None:
     store = Store.in_memory()
     unit = joined(Master(cell(), Settings(), store))
     unit.update(NOW_NS, [1])
@@ -140,10 +140,10 @@ def test_updates_and_units_that_register_again_write_nothing(store: Store) -> No
     assert store._connection.total_changes > before
 
 
-# ---------------------------------------------------------------------- configuration against what was stored
+# ---------------------------------------------------------------------- configured against stored values
 
 
-def begin_again(store: Store, watched: Cell, caplog: pytest.LogCaptureFixture, **settings: Any) -> Master:
+def restart(store: Store, watched: Cell, caplog: pytest.LogCaptureFixture, **settings: Any) -> Master:
     caplog.clear()
     caplog.set_level(logging.INFO)
     return Master(watched, Settings(**settings), store)
@@ -155,16 +155,16 @@ def test_a_cell_changed_by_the_api_outlives_the_master_until_its_file_changes(
     one = Master(with_box(), Settings(), store)
     one.move_object("box", ELSEWHERE)
     moved = one.cell.version
-    two = begin_again(store, with_box(), caplog)
+    two = restart(store, with_box(), caplog)
     assert (two.cell.version, two.versions.cell) == (moved, one.versions.cell)
-    assert "as it was changed since its file was loaded" in caplog.text
-    three = begin_again(store, with_box(0.3), caplog)
+    assert "the stored one counts" in caplog.text
+    three = restart(store, with_box(0.3), caplog)
     assert three.cell.version == with_box(0.3).version
     assert three.versions.cell == two.versions.cell + 1
     assert "its file changed and counts" in caplog.text
-    # Meshes that no cell names any more are gone.
+    # Meshes that no cell names are deleted.
     assert set(dict(store._connection.execute("SELECT sha256, 1 FROM meshes"))) == set(with_box(0.3).to_document()[1])
-    four = begin_again(store, with_box(0.3), caplog)
+    four = restart(store, with_box(0.3), caplog)
     assert (four.cell.version, four.versions) == (three.cell.version, three.versions)
     assert caplog.text == ""
 
@@ -172,40 +172,40 @@ def test_a_cell_changed_by_the_api_outlives_the_master_until_its_file_changes(
 def test_settings_of_the_configuration_count_where_they_changed(store: Store, caplog: pytest.LogCaptureFixture) -> None:
     one = Master(cell(), Settings(voxel_size_m=0.1), store)
     one.change_settings({"voxel_size_m": 0.05, "occupancy_threshold": 0.7})
-    two = begin_again(store, cell(), caplog, voxel_size_m=0.1)
+    two = restart(store, cell(), caplog, voxel_size_m=0.1)
     assert (two.settings.voxel_size_m, two.settings.occupancy_threshold) == (0.05, 0.7)
     assert two.versions == one.versions
-    assert "not as configured: voxel_size_m" in caplog.text
-    three = begin_again(store, cell(), caplog, voxel_size_m=0.08)
+    assert "the stored voxel_size_m count" in caplog.text
+    three = restart(store, cell(), caplog, voxel_size_m=0.08)
     assert (three.settings.voxel_size_m, three.settings.occupancy_threshold) == (0.08, 0.7)
     assert three.versions.settings == two.versions.settings + 1
     assert three.versions.lattice == two.versions.lattice + 1
-    assert "which counts: voxel_size_m" in caplog.text
+    assert "voxel_size_m changed in the configuration" in caplog.text
 
 
-def test_settings_of_another_version_that_do_not_fit_are_told_and_left_out(
+def test_stored_settings_that_do_not_fit_are_reported_and_left_out(
     store: Store, caplog: pytest.LogCaptureFixture
 ) -> None:
     Master(cell(), Settings(), store).change_settings({"occupancy_threshold": 0.7})
     store._connection.execute(
         "UPDATE facts SET value = json_set(value, '$.of_tomorrow', 1, '$.voxel_size_m', 9) WHERE name = 'settings'"
     )
-    one = begin_again(store, cell(), caplog)
+    one = restart(store, cell(), caplog)
     assert (one.settings.voxel_size_m, one.settings.occupancy_threshold) == (Settings().voxel_size_m, 0.7)
-    assert "of_tomorrow, voxel_size_m as stored do not fit" in caplog.text
+    assert "the stored of_tomorrow, voxel_size_m no longer fit" in caplog.text
 
 
-def test_stored_ranges_between_which_nothing_is_are_left_out(store: Store, caplog: pytest.LogCaptureFixture) -> None:
+def test_stored_empty_ranges_are_left_out(store: Store, caplog: pytest.LogCaptureFixture) -> None:
     Master(cell(), Settings(), store).change_settings({"occupancy_threshold": 0.7})
     store._connection.execute(
         "UPDATE facts SET value = json_set(value, '$.range_min_m', 5, '$.range_max_m', 0.5) WHERE name = 'settings'"
     )
-    settings = begin_again(store, cell(), caplog).settings
+    settings = restart(store, cell(), caplog).settings
     assert (settings.range_min_m, settings.range_max_m, settings.occupancy_threshold) == (5.0, 10.0, 0.7)
-    assert "range_max_m as stored do not fit" in caplog.text
+    assert "the stored range_max_m no longer fit" in caplog.text
 
 
-def test_a_range_in_which_nothing_is_measured_is_refused(store: Store) -> None:
+def test_an_empty_range_is_refused(store: Store) -> None:
     master = Master(cell(), Settings(), store)
     master.change_settings({"range_max_m": 2.0})
     for changes in ({"range_min_m": 2.0}, {"range_min_m": 5.0, "range_max_m": 0.5}):
@@ -218,11 +218,11 @@ def test_a_range_in_which_nothing_is_measured_is_refused(store: Store) -> None:
 # ---------------------------------------------------------------------- files
 
 
-def test_a_file_of_something_else_is_refused_and_left_alone(path: Path) -> None:
+def test_a_foreign_file_is_refused_and_unchanged(path: Path) -> None:
     path.parent.mkdir()
     for content in (b"", b"hello, this is text", b"x" * 100_000):
         path.write_bytes(content)
-        with pytest.raises(ConfigError, match=r"master\.db: .*begin anew"):
+        with pytest.raises(ConfigError, match=r"master\.db: .*start anew"):
             Store.open(path)
         assert path.read_bytes() == content
     path.unlink()
@@ -254,7 +254,7 @@ def test_a_store_of_a_version_that_never_was_is_refused(path: Path, version: int
         Store.open(path)
 
 
-def test_a_store_of_an_older_master_becomes_one_of_this(path: Path) -> None:
+def test_a_store_of_an_older_master_is_migrated(path: Path) -> None:
     store = Store.open(path)
     one = Master(with_box(), Settings(), store)
     one.set_pose(joined(one, 1).initialized.id, ELSEWHERE, "board", None)
@@ -290,7 +290,7 @@ def test_a_damaged_file_is_refused_and_never_replaced(path: Path) -> None:
             refused += 1
             assert path.stat().st_size == len(whole)
         else:
-            # The damage hit what no row uses.
+            # The damage hit unused bytes.
             assert saved.cell is not None
             assert saved.cell.version == with_box().version
     assert refused > 5
@@ -338,7 +338,7 @@ def test_a_log_cut_anywhere_gives_the_state_after_one_of_the_changes(path: Path,
         folder.mkdir()
         shutil.copy(path, folder / FILE_NAME)
         cut = dice.randrange(len(whole) + 1)
-        # What the disk had not written yet is missing, or is what stood there before.
+        # Bytes that the disk had not written yet are missing, or have their old values.
         (folder / log.name).write_bytes(whole[:cut] + (dice.randbytes(5000) if seed % 2 else b""))
         opened = Store.open(folder / FILE_NAME)
         found.add(states.index(opened.load().units))
@@ -365,10 +365,10 @@ def test_a_file_cut_anywhere_is_whole_or_refused(path: Path, tmp_path: Path) -> 
         opened.close()
 
 
-# ---------------------------------------------------------------------- a disk that takes nothing
+# ---------------------------------------------------------------------- a full disk
 
 
-def test_what_cannot_be_stored_does_not_happen(store: Store) -> None:
+def test_a_change_that_cannot_be_stored_is_not_applied(store: Store) -> None:
     one = Master(with_box(), Settings(), store)
     unit = joined(one, 1)
     unit.update(NOW_NS, [5], seen=sees_all(one))
@@ -397,9 +397,7 @@ def test_what_cannot_be_stored_does_not_happen(store: Store) -> None:
     assert store.trouble is None
 
 
-async def test_that_changes_can_be_stored_again_is_found_without_one(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_recovery_of_the_disk_is_detected_without_a_change(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(store_module, "TRY_EVERY_S", 0.05)
     one = await asyncio.to_thread(Master, with_box(), Settings(), store)
     await asyncio.to_thread(make_writes_fail, store)
@@ -409,20 +407,20 @@ async def test_that_changes_can_be_stored_again_is_found_without_one(
         await asyncio.to_thread(store.attempt)
     before = await asyncio.to_thread(store.load)
 
-    async def until_it_is_well() -> None:
+    async def until_recovered() -> None:
         while store.trouble is not None:
             await asyncio.sleep(0.01)
 
     task = asyncio.create_task(store.follow())
-    assert not await within(0.3, until_it_is_well())
+    assert not await within(0.3, until_recovered())
     await asyncio.to_thread(make_writes_work, store)
-    assert await within(5.0, until_it_is_well())
+    assert await within(5.0, until_recovered())
     task.cancel()
     after = await asyncio.to_thread(store.load)
     assert (after.versions, after.settings, after.units) == (before.versions, before.settings, before.units)
 
 
-def test_a_full_disk_is_told(store: Store) -> None:
+def test_a_full_disk_is_reported(store: Store) -> None:
     one = Master(cell(), Settings(), store)
     fill(store)
 
@@ -449,7 +447,7 @@ def test_a_known_unit_comes_back_though_its_new_boot_cannot_be_stored(store: Sto
 def test_meshes_ahead_of_their_cell_are_kept_for_it(store: Store) -> None:
     one = Master(cell(), Settings(), store)
     document, meshes = with_box().to_document()
-    # Those of a cell that was refused afterwards make room.
+    # Those of a cell that was refused afterwards are deleted.
     store.add_meshes(with_box(0.4).to_document()[1])
     store.add_meshes(meshes)
     assert set(dict(store._connection.execute("SELECT sha256, 1 FROM meshes"))) == set(meshes)

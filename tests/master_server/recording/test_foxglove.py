@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording is what Foxglove opens as it is: a sound MCAP file, in Foxglove's own schemas, in one tree of frames."""
+"""Foxglove opens a recording as it is: a valid MCAP file, in Foxglove's own schemas, in one tree of frames."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ PUBLISHED: dict[str, type[ProtobufMessage]] = {
     "/cell": SceneUpdate,
     "/tf": FrameTransforms,
 }
-"""What Foxglove publishes for each topic that people look at."""
+"""Foxglove's schema of each topic for people."""
 
 WORLD = "world"
 
 NUMERIC_BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 8: 8}
-"""Of a PackedElementField's types."""
+"""Sizes of the types of a PackedElementField."""
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def decoded(path: Path, topic: str) -> Iterator[tuple[Message, Any]]:
-    """The messages of a topic by nothing but the schema that lies in the file."""
+    """Decode the messages of a topic with only the schema in the file."""
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         kinds: dict[int, Any] = {}
@@ -69,7 +69,7 @@ def decoded(path: Path, topic: str) -> Iterator[tuple[Message, Any]]:
 
 
 def files_of(schema: Schema) -> dict[str, descriptor_pb2.FileDescriptorProto]:
-    """The descriptions in a schema, which must come after those that they need."""
+    """Return the descriptions in a schema; each must follow those that it needs."""
     described = descriptor_pb2.FileDescriptorSet.FromString(schema.data)
     files: dict[str, descriptor_pb2.FileDescriptorProto] = {}
     for file in described.file:
@@ -86,7 +86,7 @@ def kind_of(schema: Schema) -> Any:
 
 
 def published_files(kind: type[ProtobufMessage]) -> dict[str, descriptor_pb2.FileDescriptorProto]:
-    """What Foxglove's package says of a message, and of all that it is made of."""
+    """Return the descriptions of a message and its parts in Foxglove's package."""
     files: dict[str, descriptor_pb2.FileDescriptorProto] = {}
 
     def add(file: Any) -> None:
@@ -124,7 +124,7 @@ def test_our_own_channels_follow_the_schemas_beside_them(recorded: Path) -> None
             assert schema is not None
             assert schema.encoding == "jsonschema"
             described = json.loads(schema.data)
-            # Foxglove asks for an object at the root.
+            # Foxglove requires an object at the root.
             assert described["type"] == "object"
             if (channel.topic, message.data) not in seen and len(seen) < 200:
                 Draft202012Validator(described).validate(json.loads(message.data))
@@ -160,7 +160,7 @@ def test_frames_form_one_tree_and_everything_stands_in_it(recorded: Path) -> Non
     assert any(name.startswith("robot/") for name in used)
 
 
-def test_what_is_drawn_is_whole(recorded: Path) -> None:
+def test_drawn_entities_are_complete(recorded: Path) -> None:
     clouds = 0
     for message, cloud in decoded(recorded, "/voxels"):
         assert cloud.timestamp.ToNanoseconds() == message.log_time
@@ -183,7 +183,7 @@ def test_what_is_drawn_is_whole(recorded: Path) -> None:
                 assert (model.media_type, bool(model.url)) == ("model/stl", False)
                 count = int.from_bytes(model.data[80:84], "little")
                 assert len(model.data) == 84 + 50 * count > 84
-                # Foxglove takes a text that begins so for an ASCII STL.
+                # Foxglove takes data with this start for an ASCII STL.
                 assert not model.data.startswith(b"solid")
             for line in entity.lines:
                 assert len(line.points) % 2 == 0
@@ -191,7 +191,7 @@ def test_what_is_drawn_is_whole(recorded: Path) -> None:
 
 
 def problems(path: Path) -> list[str]:
-    """What `mcap doctor` looks for: order, ids, times, counts, offsets and checksums; empty for a sound file."""
+    """Check as `mcap doctor` does: order, ids, times, counts, offsets and checksums; empty for a valid file."""
     found: list[str] = []
     schemas: set[int] = set()
     channels: set[int] = set()
@@ -274,7 +274,7 @@ def test_it_is_a_sound_file(recorded: Path) -> None:
     assert problems(recorded) == []
     with recorded.open("rb") as stream:
         first = next(make_reader(stream).iter_messages())[2]
-    # Of this century: a viewer's timeline shows when it was.
+    # Of this century: a viewer's timeline shows the date.
     assert first.log_time > WALL_LESS_MONOTONIC_NS
     assert first.log_time - WALL_LESS_MONOTONIC_NS > S
 

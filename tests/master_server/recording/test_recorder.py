@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the master saw, in files: readable by others, bounded, and never in the master's way."""
+"""Recordings: readable by standard tools, bounded, and without delay for the master."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def records(path: Path) -> Iterator[tuple[str, str, int, bytes]]:
                 yield channel.topic, schema.name, message.log_time, message.data
 
 
-def test_others_read_it_in_the_standard_schemas(tmp_path: Path) -> None:
+def test_standard_readers_can_read_a_recording(tmp_path: Path) -> None:
     scripted(tmp_path / "a.mcap")
     names: dict[str, str] = {}
     counts: Counter[str] = Counter()
@@ -161,7 +161,7 @@ def test_the_cell_is_a_box_and_models(tmp_path: Path) -> None:
     assert len(link.models[0].data) == 84 + 12 * 50
 
 
-def test_what_serves_it_again_is_there_without_loss(tmp_path: Path) -> None:
+def test_data_for_a_replay_is_recorded_without_loss(tmp_path: Path) -> None:
     watched = scripted(tmp_path / "a.mcap")
     found = list(records(tmp_path / "a.mcap"))
     assert {(topic, name) for topic, name, _, _ in found} == {
@@ -187,7 +187,7 @@ def test_what_serves_it_again_is_there_without_loss(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_boxes_cover_exactly_what_is_chosen(seed: int) -> None:
+def test_boxes_cover_exactly_the_chosen_blocks(seed: int) -> None:
     rng = np.random.default_rng(seed)
     chosen = rng.random((7, 8, 9)) < rng.random()
     chosen[2:5, 1:6, 3:8] = True
@@ -197,7 +197,7 @@ def test_boxes_cover_exactly_what_is_chosen(seed: int) -> None:
     np.testing.assert_array_equal(covered, chosen)
 
 
-def test_unseen_boxes_stand_where_the_blocks_are() -> None:
+def test_unseen_boxes_are_at_the_blocks() -> None:
     seen_by = np.ones((4, 5, 6), np.uint8)
     seen_by[1, 2, 3] = seen_by[2, 2, 3] = seen_by[0, 0, 0] = 0
     blocks = Lattice((-1.0, 0.0, 0.5), 0.1, seen_by.shape)
@@ -229,7 +229,7 @@ def test_stl_has_the_triangles() -> None:
 
 
 def live(**settings: Any) -> Master:
-    """A master by the real clock with one unit."""
+    """Return a master by the real clock with one unit."""
     watched = master(with_robot=True, stale_after_s=60.0, **settings)
     joined(watched, 1, monotonic_ns()).update(monotonic_ns(), range(0, 4000, 2), seen=sees_all(watched))
     return watched
@@ -304,13 +304,13 @@ async def test_a_file_that_cannot_grow_ends_the_recording_with_a_reason(tmp_path
     status = await recording.stop()
     assert not status.recording
     assert status.reason == f"{status.file}: File too large"
-    # The master goes on, and recording can begin again.
+    # The master goes on, and recording can start again.
     assert unit.update(monotonic_ns(), [1]).versions == watched.versions.model_copy(update={"pose": 1})
     assert (await recording.start()).recording
     await recording.stop()
 
 
-async def test_a_full_disk_is_left_alone(tmp_path: Path) -> None:
+async def test_recording_stops_before_the_disk_is_full(tmp_path: Path) -> None:
     recording = recorder(live(), tmp_path, free_bytes_min=2**62)
     with pytest.raises(Refusal, match="bytes are left on the disk") as refused:
         await recording.start()
@@ -328,7 +328,7 @@ async def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
         await recorder(live(), tmp_path / "file" / "folder").start()
 
 
-async def test_a_slow_disk_drops_moments_and_delays_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_slow_disk_drops_moments_without_delay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     gate = threading.Event()
     add = RecordingFile.add
 

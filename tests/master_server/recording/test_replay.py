@@ -16,6 +16,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from master_server.__main__ import main
@@ -24,7 +25,7 @@ from master_server.app import make_app, make_replay_app
 from master_server.core import Master
 from master_server.recording import recording_reader as recorded_module
 from master_server.recording import timeline as timeline_module
-from master_server.recording.moment import StateRecord, moment_of
+from master_server.recording.moment import METADATA, STATE_TOPIC, StateRecord, moment_of
 from master_server.recording.recording_file import RecordingFile
 from master_server.recording.recording_reader import Recording
 from master_server.recording.replay import Replay, ReplayRequest
@@ -67,7 +68,7 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """In place of the one clock, wherever a route reads it."""
+    """Replace the clock wherever a route reads it."""
     clock = Clock()
     for module in (map, units, robot, replay):
         monkeypatch.setattr(module, "monotonic_ns", clock)
@@ -91,7 +92,7 @@ class Script:
             unit.initialize(START_NS)
 
     def step(self, number: int) -> int:
-        """Do what happens then; returns when it is over."""
+        """Run this step; return its end time."""
         now_ns = START_NS + S + number * STEP_NS
         self.master.put_joints(JointsRequest(positions=(0.01 * number, 0.5), velocities=(0.1, 0.0)), now_ns)
         if number == 20:
@@ -136,7 +137,7 @@ async def answers(app: Any) -> dict[str, Any]:
     return found
 
 
-def test_every_answer_is_as_it_was(tmp_path: Path, clock: Clock) -> None:
+def test_every_answer_equals_the_recorded_one(tmp_path: Path, clock: Clock) -> None:
     script = Script()
     app = make_app(script.master, ACCESS)
     file = RecordingFile(tmp_path / "a.mcap", WALL_LESS_MONOTONIC_NS)
@@ -148,7 +149,7 @@ def test_every_answer_is_as_it_was(tmp_path: Path, clock: Clock) -> None:
             then[number] = asyncio.run(answers(app))
     file.close()
     reasons = {tuple(found["/voxels?unseen=true"]["reasons"]) for found in then.values()}
-    # What is compared must differ between the times.
+    # The compared answers must differ between the times.
     assert len(reasons) >= 4
     assert len({found["etag"] for found in then.values()}) == 2
 
@@ -177,7 +178,7 @@ def recording(recorded: Path) -> Iterator[Timeline]:
         yield recording
 
 
-async def test_it_tells_what_it_is_and_changes_nothing(recording: Timeline, clock: Clock) -> None:
+async def test_a_replay_is_marked_and_refuses_changes(recording: Timeline, clock: Clock) -> None:
     app = make_replay_app(Replay(recording, clock=clock), ACCESS)
     health = await ask(app, "GET", "/healthz", None)
     assert health.json() == {"status": "ok", "replay": True}
@@ -204,7 +205,7 @@ async def test_it_tells_what_it_is_and_changes_nothing(recording: Timeline, cloc
         assert (await ask(app, "GET", path)).headers["cellwatch-replay"] == "true"
 
 
-def test_it_plays_pauses_and_moves(recorded: Path, clock: Clock) -> None:
+def test_a_replay_plays_pauses_and_seeks(recorded: Path, clock: Clock) -> None:
     with Timeline([recorded]) as recording:
         assert duration_s(recording) == pytest.approx((STEPS - 1) * 0.1)
         played = Replay(recording, speed=2.0, start_s=0.5, clock=clock)
@@ -247,7 +248,7 @@ import os, signal, sys
 from pathlib import Path
 from tests.master_server.recording.test_replay import WALL_LESS_MONOTONIC_NS, Script
 from master_server.recording.recording_file import RecordingFile
-from master_server.recording.moment import StateRecord, moment_of
+from master_server.recording.moment import METADATA, STATE_TOPIC, StateRecord, moment_of
 script = Script()
 file = RecordingFile(Path(sys.argv[1]), WALL_LESS_MONOTONIC_NS)
 for number in range(36):
@@ -273,7 +274,7 @@ def test_a_killed_writer_leaves_all_but_its_last_chunk(tmp_path: Path, clock: Cl
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_damaged_file_is_as_much_as_is_there_or_one_sentence(recorded: Path, seed: int) -> None:
+def test_a_damaged_file_is_read_in_part_or_refused_in_one_sentence(recorded: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
     whole = recorded.read_bytes()
     served, refused, damaged = 0, 0, 60
@@ -297,7 +298,7 @@ def test_a_damaged_file_is_as_much_as_is_there_or_one_sentence(recorded: Path, s
     assert served + refused == damaged
 
 
-def test_a_damaged_chunk_is_passed_over(recorded: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_damaged_chunk_is_skipped(recorded: Path, caplog: pytest.LogCaptureFixture) -> None:
     with Recording(recorded) as recording:
         places = recording._index.chunks
         before = recording.at(recording.begin_ns + 10 * STEP_NS)
@@ -308,10 +309,10 @@ def test_a_damaged_chunk_is_passed_over(recorded: Path, caplog: pytest.LogCaptur
     with Recording(recorded) as recording:
         assert recording.at(recording.begin_ns + 15 * STEP_NS).log_ns == before.log_ns
         assert recording.at(recording.begin_ns + 30 * STEP_NS).log_ns == recording.begin_ns + 30 * STEP_NS
-    assert "damaged, passed over" in caplog.text
+    assert "is damaged and skipped" in caplog.text
 
 
-def test_what_is_no_recording_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_is_no_recording_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "empty.mcap").write_bytes(b"")
     (tmp_path / "text.mcap").write_text("no recording at all")
     with (tmp_path / "other.mcap").open("wb") as stream:
@@ -322,7 +323,7 @@ def test_what_is_no_recording_is_named(tmp_path: Path, capsys: pytest.CaptureFix
         ("gone.mcap", "cannot be read: No such file"),
         ("empty.mcap", "it is empty"),
         ("text.mcap", "it is no MCAP file"),
-        ("other.mcap", "expected a master's recording of format 1, got None"),
+        ("other.mcap", "expected a master's recording of format 1.x, got none"),
     ):
         for command in ("recording-info", "replay"):
             assert main([command, str(tmp_path / name)]) == 1
@@ -333,12 +334,12 @@ def test_what_is_no_recording_is_named(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 class Later(StateRecord):
-    """As a later version might have it."""
+    """A record of a possible later version."""
 
     temperature_c: float
 
 
-def test_a_recording_of_another_version_is_told_when_it_is_opened(
+def test_a_recording_of_another_version_is_reported_when_opened(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorded_module, "StateRecord", Later)
@@ -346,7 +347,7 @@ def test_a_recording_of_another_version_is_told_when_it_is_opened(
         Recording(recorded)
 
 
-def test_info_tells_what_is_in_it(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_lists_the_content(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["recording-info", str(recorded)]) == 0
     out = capsys.readouterr().out
     assert "(3.9 s)" in out
@@ -374,16 +375,16 @@ def test_a_moved_object_costs_a_transform_and_no_mesh(recorded: Path) -> None:
 
 
 def record_in_files(folder: Path, steps: tuple[int, ...], missing_s: float = 0.0) -> list[Path]:
-    """The same script, with a new file after each of these numbers of steps; between two, time is missing."""
+    """Record the same script, with a new file after each of these numbers of steps; between files, time is missing."""
     script = Script()
-    paths, begun = [], 0
+    paths, startup = [], 0
     for number, ended in enumerate((*steps, STEPS)):
         paths.append(folder / f"{9 - number}.mcap")
         file = RecordingFile(paths[-1], WALL_LESS_MONOTONIC_NS + round(number * missing_s * S))
-        for step in range(begun, ended):
+        for step in range(startup, ended):
             file.add(moment_of(script.master, script.step(step)))
         file.close()
-        begun = ended
+        startup = ended
     return paths
 
 
@@ -432,9 +433,99 @@ def test_each_file_counts_once(recorded: Path) -> None:
         Timeline([recorded, recorded])
 
 
-def test_info_tells_of_all_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_covers_all_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = record_in_files(tmp_path, (13,))
     assert main(["recording-info", *(str(path) for path in paths)]) == 0
     out = capsys.readouterr().out
     assert all(str(path) in out for path in paths)
     assert "(3.9 s)" in out
+
+
+def rewritten(path: Path, target: Path, version: str, change: Callable[[str, dict[str, Any]], None]) -> Path:
+    """Write a recording again, as another version would: each JSON message after `change(topic, fields)`."""
+    with path.open("rb") as source, target.open("wb") as out:
+        reader = make_reader(source)
+        writer = Writer(out)
+        writer.start("", "")
+        writer.add_metadata(METADATA, {"format": version})
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            if channel.id not in channels:
+                assert schema is not None
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, schema_id)
+            data = message.data
+            if channel.topic.startswith("/cellwatch/"):
+                fields = json.loads(data)
+                change(channel.topic, fields)
+                data = json.dumps(fields).encode()
+            writer.add_message(channels[channel.id], message.log_time, data, message.publish_time, message.sequence)
+        for attachment in reader.iter_attachments():
+            writer.add_attachment(
+                attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
+            )
+        writer.finish()
+    return target
+
+
+def of_a_later_minor(topic: str, fields: dict[str, Any]) -> None:
+    fields["weather"] = "fog"
+    if topic == STATE_TOPIC:
+        fields["causes"] = [{"code": "fogged", "sentence": "unit 1 is fogged", "numbers": {}}]
+        fields["reasons"], fields["complete"] = ["unit 1 is fogged"], False
+        fields["robot"] |= {"state": "drifting", "drift_rad": 0.1}
+        for unit in fields["units"]:
+            unit |= {"state": "dozing", "mood": "good"}
+            unit["health"] |= {"trouble_code": "fogged", "humidity": 0.9}
+
+
+def test_a_recording_of_a_later_minor_plays_without_what_is_unknown(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    record(tmp_path / "now.mcap")
+    later = rewritten(tmp_path / "now.mcap", tmp_path / "later.mcap", "1.99", of_a_later_minor)
+    with Recording(later) as recording, Recording(tmp_path / "now.mcap") as own:
+        frame, same = recording.at(recording.begin_ns), own.at(own.begin_ns)
+    assert "its format 1.99 is newer than 1.1" in caplog.text
+    assert frame.settings == same.settings
+    np.testing.assert_array_equal(frame.view.keys, same.view.keys)
+    assert not frame.view.complete
+    assert [cause.code for cause in frame.view.causes] == ["fogged"]
+    assert {unit.state for unit in frame.state.units} == {"dozing"}
+    assert (frame.state.robot.state, frame.state.units[0].health.trouble_code) == ("drifting", "fogged")
+
+
+def test_a_recording_of_the_first_format_plays(tmp_path: Path) -> None:
+    def of_1_0(topic: str, fields: dict[str, Any]) -> None:
+        fields.pop("causes", None)
+        fields.pop("reports", None)
+        for unit in fields.get("units", ()):
+            for name in ("cause", "contract_minor"):
+                unit.pop(name, None)
+
+    record(tmp_path / "now.mcap")
+    first = rewritten(tmp_path / "now.mcap", tmp_path / "first.mcap", "1", of_1_0)
+    with Recording(first) as recording, Recording(tmp_path / "now.mcap") as own:
+        frame, same = recording.at(recording.begin_ns), own.at(own.begin_ns)
+        assert frame.view.reasons == same.view.reasons
+        np.testing.assert_array_equal(frame.view.keys, same.view.keys)
+
+
+def test_a_moment_that_is_not_complete_and_says_not_why_is_not_complete(tmp_path: Path) -> None:
+    def silent(topic: str, fields: dict[str, Any]) -> None:
+        if topic == STATE_TOPIC:
+            fields |= {"complete": False, "reasons": [], "causes": []}
+
+    record(tmp_path / "now.mcap")
+    with Recording(rewritten(tmp_path / "now.mcap", tmp_path / "silent.mcap", "1.1", silent)) as recording:
+        view = recording.at(recording.end_ns).view
+    assert not view.complete
+    assert view.reasons
+
+
+@pytest.mark.parametrize("version", ["2", "2.0", "0.9", "", "one"])
+def test_a_recording_of_another_major_is_refused_in_one_sentence(tmp_path: Path, version: str) -> None:
+    record(tmp_path / "now.mcap")
+    other = rewritten(tmp_path / "now.mcap", tmp_path / "other.mcap", version, lambda topic, fields: None)
+    with pytest.raises(SourceError, match=rf"other\.mcap: expected a master's recording of format 1\.x, got {version}"):
+        Recording(other)

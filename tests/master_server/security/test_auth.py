@@ -11,7 +11,7 @@ import pytest
 
 from master_server.security import Access, Role, load_access, token_file, write_token
 from master_server.security import auth as access_module
-from master_server.security.auth import ANYONE, LOOK_EVERY_S, OPERATORS, UNITS
+from master_server.security.auth import ANYONE, OPERATORS, READ_EVERY_S, UNITS
 from shared.errors import Refusal
 from shared.waiting import within
 
@@ -22,7 +22,7 @@ def bearer(token: bytes) -> bytes:
     return b"Bearer " + token
 
 
-def test_each_token_opens_its_own_doors() -> None:
+def test_each_token_opens_its_own_routes() -> None:
     assert ACCESS.check(bearer(ACCESS.unit_token), UNITS) is Role.UNIT
     assert ACCESS.check(bearer(ACCESS.operator_token), OPERATORS) is Role.OPERATOR
     assert ACCESS.check(b"bearer  " + ACCESS.unit_token + b" ", ANYONE) is Role.UNIT
@@ -56,7 +56,7 @@ def test_reading_needs_a_token_unless_it_is_public() -> None:
     Access(b"a" * 20, b"b" * 20, public_reads=True).check_read(None)
 
 
-def test_a_token_stands_in_no_text_about_it() -> None:
+def test_a_token_appears_in_no_text() -> None:
     assert ACCESS.unit_token.decode() not in repr(ACCESS)
     assert ACCESS.operator_token.decode() not in repr(ACCESS)
 
@@ -69,7 +69,7 @@ COUNTS_WITHIN_S = 1.0
 
 @pytest.fixture
 def access(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Access:
-    monkeypatch.setattr(access_module, "LOOK_EVERY_S", 0.02)
+    monkeypatch.setattr(access_module, "READ_EVERY_S", 0.02)
     return load_access(tmp_path, False)
 
 
@@ -93,22 +93,22 @@ async def until(look: Callable[[], object]) -> bool:
 
 
 def put(path: Path, content: bytes) -> None:
-    """As an editor does: not at once."""
+    """Write as an editor does: not in one step."""
     with path.open("wb") as file:
         file.write(content)
 
 
 async def looks(count: int) -> None:
-    """Until the files were read so often."""
+    """Wait until the files were read `count` times."""
     await asyncio.sleep(count * 0.05)
 
 
-def test_a_replaced_token_counts_soon() -> None:
-    # Seen at the next look, and streams are given half a second to hear of it.
-    assert 5 * LOOK_EVERY_S <= COUNTS_WITHIN_S / 2
+def test_a_replaced_token_takes_effect_soon() -> None:
+    # Noticed at the next read, and streams have half a second to end.
+    assert 5 * READ_EVERY_S <= COUNTS_WITHIN_S / 2
 
 
-async def test_a_file_that_is_replaced_counts_and_the_token_before_is_refused(
+async def test_a_replaced_file_takes_effect_and_the_old_token_is_refused(
     access: Access, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -120,7 +120,7 @@ async def test_a_file_that_is_replaced_counts_and_the_token_before_is_refused(
         assert access.check(bearer(after), UNITS) is Role.UNIT
         with pytest.raises(Refusal, match="unknown token"):
             access.check(bearer(before), ANYONE)
-        # The other one stays, and so do its streams; and there is a next time.
+        # The other token and its streams stay; and a second replacement works.
         assert access.check(bearer(operator), OPERATORS) is Role.OPERATOR
         assert not access.end_of(Role.OPERATOR).is_set()
         again = access.end_of(Role.UNIT)
@@ -134,20 +134,20 @@ async def test_a_file_that_is_replaced_counts_and_the_token_before_is_refused(
 
 
 @pytest.mark.parametrize("content", [None, b"", b"short", b"x" * 1000, b"two-lines-0123456789\ntwo-lines-0123456789"])
-async def test_while_a_file_holds_no_token_the_one_before_stays_and_one_warning_says_so(
+async def test_a_file_without_a_token_keeps_the_old_token_with_one_warning(
     access: Access, tmp_path: Path, content: bytes | None, caplog: pytest.LogCaptureFixture
 ) -> None:
     before, end = access.operator_token, access.end_of(Role.OPERATOR)
     path = token_file(tmp_path, Role.OPERATOR)
     async with following(access):
         await (asyncio.to_thread(path.unlink) if content is None else asyncio.to_thread(put, path, content))
-        assert await until(lambda: "the token before stays in force" in caplog.text)
+        assert await until(lambda: "the old token stays valid" in caplog.text)
         await looks(3)
         assert access.check(bearer(before), OPERATORS) is Role.OPERATOR
         assert not end.is_set()
         assert len(caplog.records) == 1
         assert "operator.token" in caplog.records[0].getMessage()
-        # The same token again is no other token; another one is.
+        # The same token again is no replacement; another one is.
         await asyncio.to_thread(put, path, before)
         await looks(3)
         assert not end.is_set()
@@ -155,6 +155,6 @@ async def test_while_a_file_holds_no_token_the_one_before_stays_and_one_warning_
         assert await until(end.is_set)
 
 
-async def test_an_access_without_a_folder_stays_as_it_is() -> None:
+async def test_an_access_without_a_folder_never_changes() -> None:
     await ACCESS.follow()
     assert ACCESS.unit_token == b"unit-token-0123456789"

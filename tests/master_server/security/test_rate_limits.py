@@ -36,19 +36,19 @@ def test_a_burst_passes_and_then_the_rate() -> None:
     assert rate.wait_ns("a", now_ns + 100 * MS) <= 0
     rate.spend("a", now_ns + 100 * MS)
     assert rate.wait_ns("a", now_ns + 100 * MS) > 0
-    # Who was silent for long has a burst again, and no more.
+    # An address that was silent for long has one burst again.
     for _ in range(3):
         assert rate.wait_ns("a", now_ns + 3600 * S) <= 0
         rate.spend("a", now_ns + 3600 * S)
     assert rate.wait_ns("a", now_ns + 3600 * S) > 0
 
 
-def test_what_machines_of_ours_ask_for_is_far_below_the_limit() -> None:
+def test_normal_load_is_far_below_the_limit() -> None:
     limits = Limits()
-    # Joints at 500 Hz, a unit of 90 fps that asks for joints before each frame, and the map at 100 Hz: of one address.
+    # From one address: joints at 500 Hz, a unit of 90 fps that polls joints before each frame, and the map at 100 Hz.
     for tick in range(10 * (500 + 180 + 100)):
         limits.admit("10.0.0.1", START_NS + tick * S // 780)
-    # And updates of a wall that fills the view, 25 times a second.
+    # Also updates with a wall that fills the view, 25 times a second.
     for tick in range(250):
         limits.admit("10.0.0.2", START_NS + tick * S // 25)
         limits.read("10.0.0.2", 2**20, START_NS + tick * S // 25)
@@ -74,7 +74,7 @@ def test_large_bodies_count_as_many_requests() -> None:
         limits.admit("10.0.0.1", START_NS)
 
 
-def test_guesses_shut_an_address_out_unless_it_has_shown_a_right_token_lately() -> None:
+def test_wrong_tokens_block_an_address_without_a_recent_valid_one() -> None:
     limits = Limits()
     limits.token_was_right("10.0.0.2", START_NS)
     for ip in ("10.0.0.1", "10.0.0.2"):
@@ -110,7 +110,7 @@ def test_connections_are_bounded_for_each_address_and_in_all() -> None:
     assert limits.connections == STRANGERS_MAX - CONNECTIONS_PER_ADDRESS
 
 
-def test_a_crowd_of_strangers_shuts_no_unit_out() -> None:
+def test_a_crowd_of_strangers_does_not_block_units() -> None:
     limits = Limits()
     for number in range(2 * STRANGERS_MAX):
         limits.connect(f"10.0.1.{number}", START_NS)
@@ -137,18 +137,18 @@ def test_connections_that_come_and_go_are_bounded_too() -> None:
     assert limits.connections == 0
 
 
-def test_no_table_grows_without_end() -> None:
+def test_tables_are_bounded() -> None:
     rate = RateLimit(10.0, 3)
     for number in range(ADDRESSES_MAX + 1000):
         rate.spend(str(number), START_NS)
     assert len(rate) == ADDRESSES_MAX
 
 
-def test_an_address_has_one_name() -> None:
+def test_an_address_has_one_form() -> None:
     assert plain_ip("::ffff:10.0.0.1") == plain_ip("10.0.0.1")
 
 
-async def test_too_many_requests_are_told_when_to_come_again(
+async def test_too_many_requests_get_a_time_to_retry(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(limits_module, "REQUESTS_BURST", 5)
@@ -182,7 +182,7 @@ async def test_guessing_ends_with_429(method: str, path: str) -> None:
     assert int(refused.headers["retry-after"]) >= 1
     assert (await desk.call(method, path, UNIT, content=b"{}")).status_code == 429
     assert (await desk.call("GET", "/units", UNIT, "10.0.0.2")).status_code == 200
-    # A neighbour at an address that is known to be good shuts nobody out.
+    # A stranger at a trusted address does not block it.
     for guess in range(2 * WRONG_TOKENS_BURST):
         await desk.call("GET", "/units", f"guess-{guess:020d}", "10.0.0.2")
     assert (await desk.call("GET", "/units", UNIT, "10.0.0.2", headers=MSGPACK)).status_code == 200
@@ -199,7 +199,7 @@ async def test_an_address_that_is_refused_again_and_again_does_not_fill_the_log(
     assert "from 10.0.0.2 refused" in caplog.text
 
 
-def test_a_unit_whose_token_was_replaced_long_ago_is_heard_within_a_second() -> None:
+def test_a_unit_with_a_new_token_is_accepted_within_a_second() -> None:
     limits = Limits()
     limits.token_was_right("a", START_NS)
     now_ns = START_NS

@@ -32,7 +32,7 @@ def test_tokens_are_made_once_for_nobody_else_and_never_logged(
 
 def test_a_new_token_is_another_one_whole_and_for_nobody_else(tmp_path: Path) -> None:
     before = load_access(tmp_path, False)
-    # What a power cut left of an earlier attempt.
+    # A left-over of a power cut during an earlier attempt.
     (tmp_path / "unit.partial").write_text("half")
     assert write_token(tmp_path, Role.UNIT) == token_file(tmp_path, Role.UNIT)
     after = load_access(tmp_path, False)
@@ -64,7 +64,7 @@ def test_a_folder_that_is_not_there_is_not_made_for_a_new_token(tmp_path: Path) 
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give files away")
-def test_what_root_writes_belongs_to_whom_the_folder_belongs(tmp_path: Path) -> None:
+def test_a_token_written_by_root_belongs_to_the_owner_of_the_folder(tmp_path: Path) -> None:
     state_dir = tmp_path / "state"
     state_dir.mkdir(mode=0o700)
     os.chown(state_dir, OTHER_USER, OTHER_GROUP)
@@ -72,21 +72,19 @@ def test_what_root_writes_belongs_to_whom_the_folder_belongs(tmp_path: Path) -> 
     assert (found.st_uid, found.st_gid, found.st_mode & 0o777) == (OTHER_USER, OTHER_GROUP, 0o600)
 
 
-def test_nobody_else_writes_a_token_that_the_master_could_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_user_cannot_write_an_unreadable_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: OTHER_USER)
     with pytest.raises(ConfigError, match=f"got user number {OTHER_USER}"):
         write_token(tmp_path, Role.UNIT)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_token_file_that_others_can_read_is_closed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_token_file_that_others_can_read_is_restricted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     load_access(tmp_path, False)
     token_file(tmp_path, Role.UNIT).chmod(0o644)
     load_access(tmp_path, False)
     assert token_file(tmp_path, Role.UNIT).stat().st_mode & 0o777 == 0o600
-    assert "can be read by others" in caplog.text
+    assert "was readable by others" in caplog.text
 
 
 @pytest.mark.parametrize("text", ["", "short", "x" * 1000, "ä" * 30, "two words 0123456789", "x" * 10**6])

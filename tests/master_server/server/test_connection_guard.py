@@ -26,7 +26,7 @@ pytestmark = pytest.mark.alone
 
 HEAD_S, MESSAGE_S = 0.3, 0.9
 SLACK_S = 1.0
-"""On a busy machine."""
+"""Timeout on a busy machine."""
 DRIP_S = 0.05
 WAIT_S = 5.0
 
@@ -38,7 +38,7 @@ UPDATE = (
 
 @dataclass
 class Place:
-    """A master behind a socket of loopback; `timers` are the seconds that its connections were given."""
+    """A master behind a socket of loopback; `timers` are the timeouts that its connections set."""
 
     port: int
     limits: Limits
@@ -55,10 +55,10 @@ async def place(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Place]:
     limits, timers = Limits(), list[float]()
 
     class Watched(GuardedHttp):
-        def _give(self, seconds: float | None) -> None:
+        def _set_timer(self, seconds: float | None) -> None:
             if seconds is not None:
                 timers.append(seconds)
-            super()._give(seconds)
+            super()._set_timer(seconds)
 
     class Server(uvicorn.Server):
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -80,14 +80,14 @@ async def place(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Place]:
 
 
 async def answer(reader: asyncio.StreamReader) -> tuple[int, bytes]:
-    """Status and body of the next answer."""
+    """Return status and body of the next answer."""
     head = await reader.readuntil(b"\r\n\r\n")
     length = int(head.lower().split(b"content-length:")[1].split(b"\r\n")[0])
     return int(head.split(b" ", 2)[1]), await reader.readexactly(length)
 
 
 async def seconds_until_closed(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, drip: bytes = b"") -> float:
-    """Sends a byte of `drip` every now and then until the other side has enough."""
+    """Send a byte of `drip` from time to time until the other side closes; return the seconds."""
     began_ns = monotonic_ns()
 
     async def send() -> None:
@@ -111,11 +111,11 @@ async def seconds_until_closed(reader: asyncio.StreamReader, writer: asyncio.Str
 
 
 @pytest.mark.parametrize("drip", [b"", HEALTH[:10] + b"a" * 500, b"GET / HTTP/1.1\r\n" + b"a:b\r\n" * 100])
-async def test_who_sends_no_head_in_time_is_let_go(drip: bytes, place: Place) -> None:
+async def test_a_slow_head_closes_the_connection(drip: bytes, place: Place) -> None:
     assert HEAD_S - 0.05 < await seconds_until_closed(*await place.connect(), drip) < HEAD_S + SLACK_S
 
 
-async def test_the_next_head_on_a_connection_has_no_longer(place: Place) -> None:
+async def test_the_next_head_on_a_connection_has_the_same_timeout(place: Place) -> None:
     reader, writer = await place.connect()
     writer.write(HEALTH)
     assert (await answer(reader))[0] == 200
@@ -127,7 +127,7 @@ async def test_the_next_head_on_a_connection_has_no_longer(place: Place) -> None
     assert await seconds_until_closed(reader, writer) < HEAD_S + SLACK_S
 
 
-async def test_who_sends_no_body_in_time_is_let_go(place: Place) -> None:
+async def test_a_slow_body_closes_the_connection(place: Place) -> None:
     reader, writer = await place.connect()
     writer.write(UPDATE)
     taken_s = await seconds_until_closed(reader, writer, b"\0" * 1000)
@@ -143,21 +143,21 @@ async def test_a_head_without_end_is_refused(place: Place) -> None:
 
 
 @pytest.mark.parametrize("noise", [b"\0" * 100, b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", b"hello\r\n\r\n"])
-async def test_what_is_no_http_is_refused_at_once(noise: bytes, place: Place) -> None:
+async def test_invalid_http_is_refused_at_once(noise: bytes, place: Place) -> None:
     reader, writer = await place.connect()
     writer.write(noise)
     assert (await answer(reader))[0] == 400
     assert await seconds_until_closed(reader, writer) < WAIT_S
 
 
-async def test_whole_requests_need_no_timer_and_a_pause_between_them_is_none_of_a_head(place: Place) -> None:
+async def test_whole_requests_and_pauses_between_them_start_no_timer(place: Place) -> None:
     reader, writer = await place.connect()
     for _ in range(20):
         writer.write(HEALTH)
         assert (await answer(reader))[0] == 200
     assert place.timers == [HEAD_S]
     await asyncio.sleep(2 * HEAD_S)
-    # In pieces that come in time.
+    # In pieces that arrive in time.
     for piece in (HEALTH[:10], HEALTH[10:]):
         writer.write(piece)
         await asyncio.sleep(DRIP_S)
@@ -169,12 +169,12 @@ async def test_whole_requests_need_no_timer_and_a_pause_between_them_is_none_of_
     writer.close()
 
 
-async def test_one_address_holds_so_many_connections_and_all_are_given_back(
+async def test_connections_of_an_address_are_bounded_and_released(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connection_guard, "HEAD_S", 2 * WAIT_S)
     held = [await place.connect("127.0.0.2") for _ in range(CONNECTIONS_PER_ADDRESS)]
-    # The system takes it in before we do; then it is reset.
+    # The operating system accepts it before we do; then it is reset.
     assert await seconds_until_closed(*await place.connect("127.0.0.2")) < WAIT_S
     reader, writer = await place.connect("127.0.0.3")
     writer.write(HEALTH)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`/stream` over a socket: who is let in, what they hear, and what becomes of those who do not read."""
+"""`/stream` over a socket: access, messages, and readers that do not read."""
 
 from __future__ import annotations
 
@@ -67,14 +67,14 @@ async def serving(access: Access | None = None, **options: Any) -> AsyncIterator
             await task
 
 
-async def heard(connection: ClientConnection) -> dict[str, Any]:
+async def received(connection: ClientConnection) -> dict[str, Any]:
     message = await connection.recv()
     found: dict[str, Any] = msgpack.unpackb(message) if isinstance(message, bytes) else json.loads(message)
     return found
 
 
 async def closing_code(connection: ClientConnection) -> int | None:
-    """Why the master closes, after whatever it still says."""
+    """Return the master's close code, after its last messages."""
     with suppress(ConnectionClosed):
         async for _ in connection:
             pass
@@ -89,13 +89,13 @@ async def refused(place: Place, query: str = "", token: str | None = UNIT, **mor
     return caught.value.response.status_code, json.loads(bytes(caught.value.response.body))["detail"]
 
 
-async def test_a_reader_hears_the_map_as_it_changes() -> None:
+async def test_a_reader_receives_the_map_as_it_changes() -> None:
     async with serving() as place, place.connect("?form=keys") as reader:
-        assert (await heard(reader))["reasons"] == ["there is no unit"]
+        assert (await received(reader))["reasons"] == ["there is no unit"]
         joined(place.master, 1, monotonic_ns()).update(monotonic_ns(), [3, 5], seen=sees_all(place.master), age_ns=MS)
-        message = await heard(reader)
+        message = await received(reader)
         while not message["complete"]:
-            message = await heard(reader)
+            message = await received(reader)
         assert message["voxels"] == [3, 5]
 
 
@@ -111,13 +111,13 @@ async def test_a_browser_offers_its_token_as_a_subprotocol_and_does_not_get_it_b
     async with serving() as place:
         async with place.connect("", None, subprotocols=["cellwatch", f"bearer.{token}"]) as reader:
             assert reader.subprotocol == "cellwatch"
-            await heard(reader)
+            await received(reader)
         async with place.connect("", None, subprotocols=[f"bearer.{token}"]) as reader:
             assert reader.subprotocol is None
         assert (await refused(place, "", None, subprotocols=["cellwatch", "bearer.wrong-token-0123456789"]))[0] == 401
 
 
-async def test_who_is_refused_hears_why() -> None:
+async def test_a_refused_reader_receives_the_reason() -> None:
     async with serving() as place:
         assert (await refused(place, "", None))[0] == 401
         assert (await refused(place, "", "wrong-token-0123456789"))[0] == 401
@@ -135,36 +135,36 @@ async def test_who_is_refused_hears_why() -> None:
 async def test_public_reads_need_no_token() -> None:
     access = Access(UNIT.encode(), OPERATOR.encode(), public_reads=True)
     async with serving(access) as place, place.connect("", None) as reader:
-        await heard(reader)
+        await received(reader)
 
 
-async def test_there_is_an_end_to_readers_and_who_leaves_makes_room() -> None:
+async def test_the_number_of_readers_is_bounded_and_a_closed_one_frees_its_place() -> None:
     async with serving() as place:
         readers = [await place.connect() for _ in range(MAX_LISTENERS)]
         assert (await refused(place))[0] == 503
         for reader in readers:
             await reader.close()
         async with place.connect() as reader:
-            await heard(reader)
+            await received(reader)
             assert len(place.stream) == 1
 
 
-async def test_what_a_reader_says_changes_nothing_unless_it_is_too_much() -> None:
+async def test_messages_of_a_reader_are_ignored_unless_too_large() -> None:
     async with serving() as place:
         async with place.connect() as reader:
             await reader.send("hello")
             await reader.send(b"\0" * 100)
             for _ in range(3):
-                await heard(reader)
+                await received(reader)
             await reader.send("x" * (MESSAGE_MAX_BYTES + 1))
             assert await closing_code(reader) == 1009
         async with place.connect() as reader:
-            await heard(reader)
+            await received(reader)
 
 
 @asynccontextmanager
 async def deaf(place: Place) -> AsyncIterator[socket.socket]:
-    """A reader that is let in and then never reads; with as small a buffer as there may be."""
+    """Yield a reader that is accepted and then never reads; with the smallest buffer possible."""
     with socket.socket() as raw:
         raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         raw.setblocking(False)
@@ -180,23 +180,23 @@ async def deaf(place: Place) -> AsyncIterator[socket.socket]:
         yield raw
 
 
-async def test_who_does_not_read_is_owed_one_message_and_delays_nobody() -> None:
+async def test_a_reader_that_does_not_read_holds_one_message_and_delays_nobody() -> None:
     async with serving() as place, deaf(place), place.connect("?form=keys") as reader:
         unit = joined(place.master, 1, monotonic_ns())
         delays_ns = []
         for step in range(60):
             unit.update(monotonic_ns(), range(2000 + step), age_ns=MS)
             changed_ns = monotonic_ns()
-            while len((await heard(reader))["voxels"]) != 2000 + step:
+            while len((await received(reader))["voxels"]) != 2000 + step:
                 pass
             delays_ns.append(monotonic_ns() - changed_ns)
         idle = min(place.stream.listeners, key=lambda listener: listener.sent)
-        # Each message is some 20 kB: the kernel took the first few, one is held, all others were never made for it.
+        # Each message is about 20 kB: the kernel took the first few, one waits, and no others were made for it.
         assert idle.sent <= 10
         assert sorted(delays_ns)[len(delays_ns) // 2] < 33 * MS
 
 
-async def test_who_does_not_answer_pings_is_let_go() -> None:
+async def test_a_reader_that_answers_no_pings_is_disconnected() -> None:
     began_ns = monotonic_ns()
     async with serving(ws_ping_interval=0.2, ws_ping_timeout=0.2) as place, deaf(place):
         unit = joined(place.master, 1, monotonic_ns())
@@ -211,10 +211,10 @@ async def test_who_does_not_answer_pings_is_let_go() -> None:
     assert monotonic_ns() - began_ns < WAIT_S * NS_PER_S
 
 
-async def test_a_master_that_stops_says_so_to_its_readers() -> None:
+async def test_a_stopping_master_closes_its_streams() -> None:
     async with serving() as place:
         reader = await place.connect()
-        await heard(reader)
+        await received(reader)
     assert await closing_code(reader) == 1012
 
 
@@ -222,21 +222,21 @@ async def test_a_stream_ends_with_the_token_that_it_was_opened_with() -> None:
     access = Access(UNIT.encode(), OPERATOR.encode())
     new = "another-token-0123456789"
     async with serving(access) as place, place.connect() as first, place.connect(token=OPERATOR) as other:
-        await heard(first)
+        await received(first)
         began_ns = monotonic_ns()
         access.replace(Role.UNIT, new.encode())
         assert await closing_code(first) == TOKEN_REPLACED == 1008
         assert first.close_reason == "the token was replaced"
         assert monotonic_ns() - began_ns < CLOSE_S * NS_PER_S
         assert len(place.stream) == 1
-        await heard(other)
-        await heard(other)
+        await received(other)
+        await received(other)
         assert (await refused(place))[0] == 401
         async with place.connect(token=new) as again:
-            await heard(again)
+            await received(again)
 
 
-async def test_a_window_of_the_viewer_ends_with_its_token_too(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_viewer_connection_ends_with_its_token_too(monkeypatch: pytest.MonkeyPatch) -> None:
     async def silent(inner: ServerConnection) -> None:
         await inner.wait_closed()
 
@@ -262,20 +262,20 @@ async def test_a_window_of_the_viewer_ends_with_its_token_too(monkeypatch: pytes
 async def test_a_public_stream_outlives_every_token() -> None:
     access = Access(UNIT.encode(), OPERATOR.encode(), public_reads=True)
     async with serving(access) as place, place.connect() as reader:
-        await heard(reader)
+        await received(reader)
         access.replace(Role.UNIT, b"another-token-0123456789")
         for _ in range(3):
-            await heard(reader)
+            await received(reader)
 
 
-async def test_who_does_not_read_is_let_go_with_its_token_too() -> None:
+async def test_a_reader_that_does_not_read_is_disconnected_with_its_token_too() -> None:
     access = Access(UNIT.encode(), OPERATOR.encode())
     async with serving(access, ws_ping_interval=None) as place, deaf(place) as raw:
         unit = joined(place.master, 1, monotonic_ns())
         (listener,) = place.stream.listeners
 
         async def until_it_is_behind() -> None:
-            while place.stream.picture is None or place.stream.picture.number < listener.sent + 5:
+            while place.stream.snapshot is None or place.stream.snapshot.number < listener.sent + 5:
                 unit.update(monotonic_ns(), range(4000), age_ns=MS)
                 await asyncio.sleep(0.02)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is relied on of uvicorn's internals, which no version of it promises; before the cap is raised, these must pass.
+"""The internals of uvicorn that we rely on, which no version promises. These must pass before the cap is raised.
 
 `GuardedHttp`, `ReaderSocket` and `Acceptor` are built on them. Here stand uvicorn's own classes, without ours, at a
 transport that only keeps what it was told.
@@ -72,7 +72,7 @@ class FakeTransport(asyncio.Transport):
 
 
 class Recording(HttpToolsProtocol):
-    """Which of the methods that ours override are called, and when."""
+    """Record the calls of the methods that our class overrides."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -121,7 +121,7 @@ def config_of(**options: Any) -> uvicorn.Config:
 
 
 async def ended(state: ServerState) -> None:
-    """End what the protocols started."""
+    """End all tasks of the protocols."""
     for task in tuple(state.tasks):
         task.cancel()
     await asyncio.gather(*state.tasks, return_exceptions=True)
@@ -141,7 +141,7 @@ async def answered(transport: FakeTransport, begin: bytes) -> None:
     raise AssertionError(f"expected {begin!r}, got {bytes(transport.written)!r}")
 
 
-async def test_a_connection_is_told_of_each_part_of_a_request_in_order() -> None:
+async def test_uvicorn_calls_a_method_for_each_part_of_a_request_in_order() -> None:
     state = ServerState()
     protocol, transport = http(state)
     assert protocol.transport is transport
@@ -157,7 +157,7 @@ async def test_a_connection_is_told_of_each_part_of_a_request_in_order() -> None
     await ended(state)
 
 
-async def test_what_comes_behind_a_body_is_told_as_headers() -> None:
+async def test_trailers_arrive_as_headers() -> None:
     state = ServerState()
     protocol, _ = http(state)
     protocol.data_received(CHUNKED)
@@ -179,7 +179,7 @@ async def test_a_refusal_is_written_and_closes(caplog: pytest.LogCaptureFixture)
     assert caplog.records[0].name == "uvicorn.error"
 
 
-async def test_another_upgrade_than_ours_is_the_other_noise(caplog: pytest.LogCaptureFixture) -> None:
+async def test_an_unsupported_upgrade_logs_the_other_noise(caplog: pytest.LogCaptureFixture) -> None:
     state = ServerState()
     protocol, _ = http(state)
     protocol.data_received(UPGRADE.replace(b"websocket", b"h2c"))
@@ -200,14 +200,14 @@ async def test_an_upgrade_hands_the_transport_to_the_websocket_of_the_configurat
     assert transport.get_protocol().transport is transport
     assert protocol not in state.connections
     await answered(transport, b"HTTP/1.1 101")
-    # What the log leaves out, for it has the whole address.
+    # The log filters this line, since it has the whole address.
     assert any(logs.ACCESS_LINE in str(record.msg) for record in caplog.records)
     transport.get_protocol().connection_lost(None)
     await ended(state)
 
 
 async def socket_at(transport: FakeTransport, state: ServerState, **options: Any) -> WebSocketsSansIOProtocol:
-    """A WebSocket that was accepted."""
+    """Return an accepted WebSocket."""
     protocol = WebSocketsSansIOProtocol(config_of(ws=WebSocketsSansIOProtocol, **options), state, {})
     protocol.connection_made(transport)
     assert protocol.transport is transport
@@ -218,7 +218,7 @@ async def socket_at(transport: FakeTransport, state: ServerState, **options: Any
 
 
 async def test_a_message_waits_while_the_transport_is_full() -> None:
-    """This makes the slot of one: whoever sends next finds the newest."""
+    """This makes a slot of one: the next sender finds the newest."""
     state, transport = ServerState(), FakeTransport()
     protocol = await socket_at(transport, state)
     protocol.pause_writing()
@@ -233,7 +233,7 @@ async def test_a_message_waits_while_the_transport_is_full() -> None:
     await ended(state)
 
 
-async def test_a_close_is_sent_as_a_message_and_leaves_the_transport_to_whoever_reads() -> None:
+async def test_a_close_is_sent_as_a_message_and_keeps_the_transport_open() -> None:
     state, transport = ServerState(), FakeTransport()
     protocol = await socket_at(transport, state)
     await protocol.send({"type": "websocket.close", "code": 1000})
@@ -243,7 +243,7 @@ async def test_a_close_is_sent_as_a_message_and_leaves_the_transport_to_whoever_
     await ended(state)
 
 
-async def test_who_does_not_answer_pings_is_told_to_the_method_that_is_overridden(
+async def test_a_missing_pong_calls_the_overridden_method(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     state, transport, timers = ServerState(), FakeTransport(), []
@@ -269,7 +269,7 @@ async def test_who_does_not_answer_pings_is_told_to_the_method_that_is_overridde
     await ended(state)
 
 
-def test_the_configuration_takes_ours_for_its_protocols() -> None:
+def test_the_configuration_accepts_our_protocols() -> None:
     config = uvicorn.Config(app, http=GuardedHttp, log_config=None, **SERVER_OPTIONS)
     config.load()
     assert config.http_protocol_class is GuardedHttp
@@ -278,7 +278,7 @@ def test_the_configuration_takes_ours_for_its_protocols() -> None:
     assert found == SERVER_OPTIONS
 
 
-async def test_a_server_without_sockets_has_what_the_acceptor_makes_protocols_of() -> None:
+async def test_a_server_without_sockets_has_the_attributes_that_the_acceptor_uses() -> None:
     config = config_of(lifespan="off")
     config.load()
     server = uvicorn.Server(config)
@@ -298,10 +298,10 @@ async def test_a_server_without_sockets_has_what_the_acceptor_makes_protocols_of
 
 
 @pytest.mark.parametrize(("ours", "base"), [(GuardedHttp, HttpToolsProtocol), (ReaderSocket, WebSocketsSansIOProtocol)])
-def test_nothing_of_ours_hides_what_it_does_not_mean_to(
+def test_our_classes_override_no_attribute_by_accident(
     ours: type[asyncio.Protocol], base: type[asyncio.Protocol]
 ) -> None:
-    """A name that a newer base takes for itself would be ours by accident."""
+    """A newer base class may use one of our names, which we would then override by accident."""
     overridden = {name for name in vars(ours) if name in dir(base) and not name.startswith("__")}
     own = {name for name in vars(ours) if not name.startswith("__")} - overridden
     assert (

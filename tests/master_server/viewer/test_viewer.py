@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The operator's window without a browser: who is let in, what is passed on, what is drawn."""
+"""The viewer without a browser: access, forwarded messages, drawn data."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from master_server.api.history import SAMPLES_MAX, History, Sample
 from master_server.app import add_viewer, make_app
 from master_server.core import Master
 from master_server.security import Access, Role
-from master_server.viewer.channel import LENGTH, Asker, pack, receive
+from master_server.viewer.channel import LENGTH, MasterChannel, pack, receive
 from master_server.viewer.messages import (
     ApiAnswer,
     ApiRequest,
     BeginAnswer,
     BeginRequest,
-    Look,
-    LookRequest,
     ReadyAnswer,
     ReadyRequest,
     RefusedAnswer,
+    StateRequest,
     ViewerMessage,
+    ViewerState,
 )
 from master_server.viewer.panel import contact_sheet, legend_html, status_html, table_html
 from master_server.viewer.proxy import LOGIN_PAGE, Gate, is_passed, link_path
@@ -50,7 +50,7 @@ from master_server.viewer.scene import (
     view_edges,
 )
 from master_server.viewer.sessions import LINK_S, LINKS_MAX, SESSION_S, Sessions, Viewer
-from master_server.viewer.snapshot import look
+from master_server.viewer.snapshot import viewer_state
 from master_server.viewer.window import voxels_of
 from shared.camera import Intrinsics
 from shared.errors import Refusal, WireError
@@ -77,7 +77,7 @@ def morsel(response: httpx.Response) -> Morsel[str]:
     return found
 
 
-async def test_without_a_token_there_is_only_the_way_in(served: SimpleNamespace) -> None:
+async def test_without_a_token_only_the_login_page_is_served(served: SimpleNamespace) -> None:
     answer = await served.client.get("/viewer/")
     assert answer.status_code == 401
     assert answer.text == LOGIN_PAGE
@@ -102,7 +102,7 @@ async def test_a_token_is_exchanged_for_a_cookie(served: SimpleNamespace, token:
 
 
 @pytest.mark.parametrize("body", [{"token": "x" * 32}, {"code": "x"}, {"code": ""}, {"token": "\ud800é"}])
-async def test_what_is_wrong_opens_nothing(served: SimpleNamespace, body: dict[str, str]) -> None:
+async def test_a_wrong_code_or_token_is_refused(served: SimpleNamespace, body: dict[str, str]) -> None:
     answer = await served.client.post(
         "/viewer/login", content=json.dumps(body), headers={"Content-Type": "application/json"}
     )
@@ -110,12 +110,12 @@ async def test_what_is_wrong_opens_nothing(served: SimpleNamespace, body: dict[s
     assert "set-cookie" not in answer.headers
 
 
-async def test_neither_does_nothing_at_all(served: SimpleNamespace) -> None:
+async def test_an_empty_login_is_refused(served: SimpleNamespace) -> None:
     answer = await served.client.post("/viewer/login", json={})
     assert (answer.status_code, answer.json()["detail"]) == (422, "body: expected a code or a token, got neither")
 
 
-async def test_guesses_are_slowed_down(served: SimpleNamespace) -> None:
+async def test_wrong_logins_are_rate_limited(served: SimpleNamespace) -> None:
     codes = [(await served.client.post("/viewer/login", json={"code": f"guess{i}"})).status_code for i in range(30)]
     assert codes[0] == 401
     assert codes[-1] == 429
@@ -140,7 +140,7 @@ async def test_another_page_cannot_log_anyone_in(served: SimpleNamespace) -> Non
     assert own.status_code == 204
 
 
-def test_a_link_grows_old() -> None:
+def test_a_link_expires() -> None:
     sessions = Sessions(Access(UNIT, OPERATOR))
     code = sessions.make_code(START_NS)
     with pytest.raises(Refusal, match="not opened yet"):
@@ -160,7 +160,7 @@ def test_a_link_is_void_with_the_token_under_which_it_was_made() -> None:
         sessions.redeem(code, START_NS)
 
 
-def test_a_cookie_is_worth_as_much_as_the_token_behind_it() -> None:
+def test_a_cookie_is_valid_as_long_as_its_token() -> None:
     sessions = Sessions(Access(UNIT, OPERATOR))
     for viewer in Viewer:
         cookie = sessions.cookie(viewer, WALL_NS)
@@ -190,74 +190,74 @@ def test_a_cookie_is_worth_as_much_as_the_token_behind_it() -> None:
         ([], False),
     ],
 )
-def test_only_what_a_person_does_is_passed_on(message: Any, passed: bool) -> None:
+def test_only_actions_of_a_user_are_forwarded(message: Any, passed: bool) -> None:
     assert is_passed(msgpack.packb(message)) is passed
 
 
 @pytest.mark.parametrize("data", [b"", b"\xc1", b"\x81", b"\x91" * 3000, b"\x81\xff"])
-def test_noise_is_not_passed_on(data: bytes) -> None:
+def test_noise_is_not_forwarded(data: bytes) -> None:
     assert not is_passed(data)
 
 
-def test_a_look_tells_what_is_drawn() -> None:
+def test_a_state_has_all_data_to_draw() -> None:
     watched = master()
     history = History(watched)
     history.take(START_NS - S)
     history.take(START_NS)
-    told = told_of(watched, history, LookRequest(units=True, unseen=True, since_ns=START_NS - S))
-    assert told.history == (Sample(START_NS, None, 0, 0, False),)
-    assert told.map.lattice.lattice() == watched.lattice
-    assert told.seen is not None
-    assert told.seen.blocks.lattice() == watched.coverage.blocks
-    assert len(told.seen.bits) == -(-watched.coverage.blocks.cell_count // 8)
-    assert told.reasons == ("there is no unit",)
-    assert told.robot.state == "none"
-    assert "The map is not complete" in status_html(told)
-    assert told.units == ()
-    assert "No unit has registered yet" in table_html(told.units)
-    least = told_of(watched, history, LookRequest())
+    state = state_of(watched, history, StateRequest(units=True, unseen=True, since_ns=START_NS - S))
+    assert state.history == (Sample(START_NS, None, 0, 0, False),)
+    assert state.map.lattice.lattice() == watched.lattice
+    assert state.seen is not None
+    assert state.seen.blocks.lattice() == watched.coverage.blocks
+    assert len(state.seen.bits) == -(-watched.coverage.blocks.cell_count // 8)
+    assert state.reasons == ("there is no unit",)
+    assert state.robot.state == "none"
+    assert "The map is not complete" in status_html(state)
+    assert state.units == ()
+    assert "No unit has registered yet" in table_html(state.units)
+    least = state_of(watched, history, StateRequest())
     assert (least.units, least.history, least.map.reports, least.seen) == (None, (), None, None)
 
 
-def told_of(watched: Master, history: History, wanted: LookRequest, now_ns: int = START_NS) -> Look:
-    """A look as it comes out of the channel."""
-    packed = pack(1, look(watched, history, wanted, now_ns))
+def state_of(watched: Master, history: History, wanted: StateRequest, now_ns: int = START_NS) -> ViewerState:
+    """Return a state as it arrives through the channel."""
+    packed = pack(1, viewer_state(watched, history, wanted, now_ns))
     _, fields = msgpack.unpackb(packed[LENGTH.size :], strict_map_key=False)
-    return Look.model_validate(fields)
+    return ViewerState.model_validate(fields)
 
 
 def row(watched: Master, **changes: Any) -> UnitRow:
-    """The row of the one unit of a master, changed."""
+    """Return the row of a master's only unit, with changes."""
     (found,) = watched.units(START_NS)
     return found.model_copy(update=changes)
 
 
-def test_colours_tell_how_many_or_who() -> None:
+def test_colours_show_the_count_or_the_unit() -> None:
     watched = master()
     for number, keys in ((1, [3, 4]), (2, [4, 5])):
         joined(watched, number).update(START_NS, keys, seen=sees_all(watched))
     history = History(watched)
-    voxels = voxels_of(told_of(watched, history, LookRequest(reports=True)).map)
+    voxels = voxels_of(state_of(watched, history, StateRequest(reports=True)).map)
     assert voxels.owners.tolist() == [1, 0, 2]
     assert voxels.colours(by_unit=False).tolist() == linear([WITNESS_COLOURS[i] for i in (0, 1, 0)]).tolist()
     expected = linear([unit_colour(1), SHARED_COLOUR, unit_colour(2)])
     assert voxels.colours(by_unit=True).tolist() == expected.tolist()
-    # Nobody asked who reports them.
-    assert voxels_of(told_of(watched, history, LookRequest()).map).owners.tolist() == [0, 0, 0]
+    # The reports were not requested.
+    assert voxels_of(state_of(watched, history, StateRequest()).map).owners.tolist() == [0, 0, 0]
 
 
-def test_what_is_linear_is_shown_as_meant() -> None:
+def test_linear_colours_match_screen_colours() -> None:
     assert linear([(0, 0, 0), (255, 128, 10)]).tolist() == [[0, 0, 0], [255, 55, 1]]
 
 
-def test_every_colour_of_a_unit_is_another() -> None:
+def test_colours_of_units_differ() -> None:
     colours = np.array([*UNIT_COLOURS, SHARED_COLOUR], int)
     apart = np.abs(colours[:, None] - colours[None]).sum(axis=2) + 999 * np.eye(len(colours), dtype=int)
     assert apart.min() > 100
     assert unit_colour(len(UNIT_COLOURS) + 1) == unit_colour(1)
 
 
-def test_a_legend_names_what_is_drawn() -> None:
+def test_a_legend_names_the_drawn_colours() -> None:
     rows = (1, 4)
     assert [text in legend_html(False, rows, True) for text in ("1 unit<", "2 units<", "3 or more<", "unit 4")] == [
         True, True, True, False,
@@ -280,16 +280,16 @@ def test_a_view_is_that_of_its_own_camera() -> None:
         assert (edges[:4, 1, 2] == 2.0).all()
 
 
-def test_who_learns_shows_how_far_it_is() -> None:
+def test_a_learning_unit_shows_its_progress() -> None:
     watched = master()
     joined(watched)
     health = Health(progress=Progress(task="background", done=12, total=60))
     assert '<progress value="12" max="60"></progress>' in table_html([row(watched, reason="learns", health=health)])
-    # A unit of contract 5.0, or a recording of one, tells it to people only.
+    # A unit of contract 5.0, or its recording, has this as a sentence only.
     assert "<progress" not in table_html([row(watched, reason="learning the background: frame 12 of 60")])
 
 
-async def test_the_last_minutes_are_there_for_who_asks() -> None:
+async def test_the_history_has_the_last_minutes() -> None:
     watched = master()
     app = make_app(watched, Access(UNIT, OPERATOR))
     joined(watched, 1).update(START_NS, [3], seen=sees_all(watched))
@@ -298,14 +298,14 @@ async def test_the_last_minutes_are_there_for_who_asks() -> None:
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://master:8420") as client:
         assert (await client.get("/history")).status_code == 401
         answer = await client.get("/history", headers={"Authorization": f"Bearer {UNIT.decode()}"})
-    told = answer.json()
-    assert len(told["at_ns"]) == len(told["voxels"]) == SAMPLES_MAX
-    assert told["at_ns"][0] == START_NS + 5 * S // 1000
-    assert (told["voxels"][0], told["units_live"][0], told["complete"][0]) == (1, 1, True)
-    assert told["oldest_view_age_s"][0] == pytest.approx(0.035, abs=2e-3)
+    state = answer.json()
+    assert len(state["at_ns"]) == len(state["voxels"]) == SAMPLES_MAX
+    assert state["at_ns"][0] == START_NS + 5 * S // 1000
+    assert (state["voxels"][0], state["units_live"][0], state["complete"][0]) == (1, 1, True)
+    assert state["oldest_view_age_s"][0] == pytest.approx(0.035, abs=2e-3)
 
 
-def test_what_a_unit_says_of_itself_is_no_markup() -> None:
+def test_names_reported_by_a_unit_are_escaped() -> None:
     watched = master()
     joined(watched)
     command = CommandRow(id=1, verb="refine", outcome="<i>")
@@ -338,7 +338,7 @@ def test_the_faces_of_a_voxel_look_outwards() -> None:
     assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0 == pytest.approx(24.0)
 
 
-def test_three_pictures_are_one() -> None:
+def test_three_images_are_joined() -> None:
     first, second, third = (np.full((2, 3, 3), value, np.uint8) for value in (1, 2, 3))
     sheet = contact_sheet([first, second, third])
     assert sheet.shape == (4, 6, 3)
@@ -348,12 +348,12 @@ def test_three_pictures_are_one() -> None:
 REQUESTS: tuple[ViewerMessage, ...] = (
     BeginRequest(),
     ReadyRequest(port=8421),
-    LookRequest(units=True, since_ns=START_NS),
+    StateRequest(units=True, since_ns=START_NS),
     ApiRequest(method="PUT", path="/settings", body={"voxel_size_m": 0.1}, viewer=Viewer.OPERATOR),
 )
 
 
-async def test_each_request_arrives_as_it_was_asked() -> None:
+async def test_each_request_arrives_unchanged() -> None:
     reader = asyncio.StreamReader()
     for number, request in enumerate(REQUESTS):
         reader.feed_data(pack(number, request))
@@ -363,7 +363,7 @@ async def test_each_request_arrives_as_it_was_asked() -> None:
 
 
 @pytest.mark.parametrize("fields", [{"verb": "begin", "more": 1}, {"verb": "stop"}, {}, None, {"verb": "ready"}])
-async def test_what_no_window_asks_is_refused(fields: object) -> None:
+async def test_an_unknown_request_is_refused(fields: object) -> None:
     reader = asyncio.StreamReader()
     data = msgpack.packb((1, fields))
     reader.feed_data(LENGTH.pack(len(data)) + data)
@@ -380,32 +380,32 @@ async def test_what_no_window_asks_is_refused(fields: object) -> None:
         (ApiAnswer(status=200, body=b"1"), "no BeginAnswer"),
     ],
 )
-def test_an_answer_is_of_the_kind_that_was_asked_for(answer: ViewerMessage, expected: str | None) -> None:
+def test_an_answer_has_the_requested_type(answer: ViewerMessage, expected: str | None) -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        asker = Asker(theirs)
-        listening = threading.Thread(target=asker.listen)
+        channel = MasterChannel(theirs)
+        listening = threading.Thread(target=channel.listen)
         listening.start()
 
         def answer_it() -> None:
-            # The first question of an asker is number 0.
+            # The first request of a channel is number 0.
             ours.recv(LENGTH.size)
             ours.sendall(pack(0, answer))
 
         waiting = threading.Thread(target=answer_it)
         waiting.start()
         if expected is None:
-            assert asker.ask(BeginRequest(), BeginAnswer) == answer
+            assert channel.request(BeginRequest(), BeginAnswer) == answer
         else:
             with pytest.raises(Refusal, match=expected):
-                asker.ask(BeginRequest(), BeginAnswer)
+                channel.request(BeginRequest(), BeginAnswer)
         waiting.join()
         ours.shutdown(socket.SHUT_RDWR)
         listening.join()
 
 
-def test_the_private_parts_of_viser_that_the_window_takes_are_there() -> None:
-    """A contract: `window` asks who comes by these, for viser itself asks nobody; another version may lack them."""
+def test_the_private_attributes_of_viser_that_we_use_exist() -> None:
+    """Pin these: `window` authenticates through them, since viser does not; another version may lack them."""
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
         callbacks = server._websock_server._client_connect_cb

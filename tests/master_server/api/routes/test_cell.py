@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cell is changed while units run: over HTTP, and what it means for the map."""
+"""Changes of the cell while units run: over HTTP, and their effect on the map."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def watched(size_m: tuple[float, float, float] = (1.0, 2.0, 0.5), reach_m: float
 
 
 def live(one: Master, *keys: int) -> FakeUnit:
-    """A unit that has just reported and sees everything, in a cell whose robot reports."""
+    """Return a unit that has just reported and sees everything, in a cell whose robot reports."""
     one.put_joints(JointsRequest(positions=(0.0, 0.0)), NOW_NS)
     unit = joined(one)
     unit.update(NOW_NS, keys, seen=sees_all(one))
@@ -57,7 +57,7 @@ def live(one: Master, *keys: int) -> FakeUnit:
 # ---------------------------------------------------------------------- the master
 
 
-def test_after_a_move_nothing_counts_until_units_work_with_it() -> None:
+def test_after_a_move_reports_count_once_units_use_the_new_pose() -> None:
     one = Master(watched(), Settings())
     unit = live(one, 5, 6)
     old = unit.versions
@@ -67,7 +67,7 @@ def test_after_a_move_nothing_counts_until_units_work_with_it() -> None:
     view = one.view(NOW_NS)
     assert (view.keys.tolist(), view.complete) == ([], False)
     assert view.reasons == ("unit 1 (10.0.0.1) is stale: it does not work with the current cell yet",)
-    # A frame that was under way still belongs to the old cell; its answer names the new one.
+    # A frame in progress still belongs to the old cell; its answer names the new one.
     told = unit.update(NOW_NS, [5, 6], seen=sees_all(one))
     assert told.cell == answer.cell
     assert told.lattice is None
@@ -81,7 +81,7 @@ def test_after_a_move_nothing_counts_until_units_work_with_it() -> None:
     assert (view.keys.tolist(), view.complete) == ([7], True)
 
 
-def test_another_box_is_another_lattice_and_nothing_old_is_merged() -> None:
+def test_another_box_makes_another_lattice_and_old_reports_are_dropped() -> None:
     one = Master(watched(), Settings())
     unit = live(one, 5)
     before = unit.versions
@@ -94,7 +94,7 @@ def test_another_box_is_another_lattice_and_nothing_old_is_merged() -> None:
     assert told.cell is not None
     view = one.view(NOW_NS)
     assert (view.lattice.shape, view.keys.tolist(), view.complete) == ((40, 40, 10), [], False)
-    # The new cell with the old lattice is no half measure.
+    # The new cell with the old lattice is refused as well.
     half = before.model_copy(update={"cell": 2})
     unit.versions = half
     unit.update(NOW_NS, [5], seen=sees_all(one))
@@ -112,14 +112,14 @@ def test_joints_are_kept_while_the_robot_is_the_same() -> None:
     assert one.robot.newest is None
 
 
-def test_the_same_cell_again_disturbs_nobody() -> None:
+def test_the_same_cell_again_leaves_units_live() -> None:
     one = Master(watched(), Settings())
     live(one, 5)
     assert one.change_cell(watched()).versions.cell == 1
     assert one.view(NOW_NS).complete
 
 
-def test_a_cell_that_cannot_be_watched_changes_nothing() -> None:
+def test_an_invalid_cell_changes_nothing() -> None:
     one = Master(watched(), Settings())
     live(one, 5)
     with pytest.raises(InputError, match="smaller box"):
@@ -153,7 +153,7 @@ async def document_of(desk: Desk) -> dict[str, Any]:
     return found
 
 
-async def test_a_folder_in_a_zip_becomes_the_cell(desk: Desk) -> None:
+async def test_a_zip_of_a_folder_replaces_the_cell(desk: Desk) -> None:
     response = await desk.call("PUT", "/cell", content=packed({"cell.yaml": CELL_YAML}), headers=ZIP)
     assert response.status_code == 200, response.text
     document = await document_of(desk)
@@ -180,7 +180,7 @@ async def test_a_folder_in_a_zip_becomes_the_cell(desk: Desk) -> None:
         ),
     ],
 )
-async def test_what_is_no_cell_changes_nothing(desk: Desk, content: bytes, said: str) -> None:
+async def test_an_invalid_zip_changes_nothing(desk: Desk, content: bytes, said: str) -> None:
     before = await document_of(desk)
     response = await desk.call("PUT", "/cell", content=content, headers=ZIP)
     assert response.status_code == 422
@@ -191,7 +191,7 @@ async def test_what_is_no_cell_changes_nothing(desk: Desk, content: bytes, said:
 
 
 @pytest.mark.parametrize("as_msgpack", [False, True])
-async def test_an_edited_document_becomes_the_cell(desk: Desk, as_msgpack: bool) -> None:
+async def test_an_edited_document_replaces_the_cell(desk: Desk, as_msgpack: bool) -> None:
     document = await document_of(desk)
     document["objects"][0]["T_world_mesh"] = MOVED.tolist()
     document["box_max_m"] = [1.0, 1.0, 1.0]
@@ -214,7 +214,7 @@ async def test_an_edited_document_becomes_the_cell(desk: Desk, as_msgpack: bool)
         ({"more": 1}, "more"),
     ],
 )
-async def test_a_document_that_is_no_cell_changes_nothing(desk: Desk, change: dict[str, Any], said: str) -> None:
+async def test_an_invalid_document_changes_nothing(desk: Desk, change: dict[str, Any], said: str) -> None:
     before = await document_of(desk)
     for document in ({**before, **change}, [], "cell"):
         response = await desk.call("PUT", "/cell", json=document)
@@ -233,9 +233,7 @@ async def test_a_zip_beyond_its_bound_is_refused(desk: Desk, monkeypatch: pytest
     assert response.status_code == 413
 
 
-async def test_one_cell_is_read_at_a_time_and_no_longer_than_it_may(
-    desk: Desk, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_one_cell_is_read_at_a_time_and_within_its_timeout(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     content = packed({"cell.yaml": CELL_YAML})
     first, second = await asyncio.gather(
         desk.call("PUT", "/cell", content=content, headers=ZIP), desk.call("PUT", "/cell", content=content, headers=ZIP)
@@ -249,7 +247,7 @@ async def test_one_cell_is_read_at_a_time_and_no_longer_than_it_may(
     )
 
 
-async def test_nothing_is_left_on_the_disk(desk: Desk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+async def test_no_file_is_left_on_the_disk(desk: Desk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(cell_loading.tempfile, "tempdir", str(tmp_path))
     for content in (packed({"cell.yaml": CELL_YAML}), b"no zip"):
         await desk.call("PUT", "/cell", content=content, headers=ZIP)
@@ -276,7 +274,7 @@ async def test_an_object_is_moved(desk: Desk) -> None:
         ("crate", None, 422, "T_world_object"),
     ],
 )
-async def test_a_move_that_cannot_be_changes_nothing(desk: Desk, name: str, pose: Any, status: int, said: str) -> None:
+async def test_an_invalid_move_changes_nothing(desk: Desk, name: str, pose: Any, status: int, said: str) -> None:
     before = await document_of(desk)
     response = await desk.call("PUT", f"/cell/objects/{name}/pose", json={"T_world_object": pose})
     assert response.status_code == status
@@ -284,7 +282,7 @@ async def test_a_move_that_cannot_be_changes_nothing(desk: Desk, name: str, pose
     assert await document_of(desk) == before
 
 
-async def test_the_demo_cell_as_its_folder_lies_there(desk: Desk) -> None:
+async def test_the_folder_of_the_demo_cell_can_be_uploaded(desk: Desk) -> None:
     folder = Path(__file__).resolve().parents[4] / "assets" / "cells" / "demo"
 
     def read() -> tuple[bytes, PublishedCell]:

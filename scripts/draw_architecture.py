@@ -30,7 +30,7 @@ PROCESSES = {
     "master_server/cells/cell_loading.py": "unpacking process",
     "master_server/viewer/host.py": "viewer process",
 }
-"""Where the product starts a process, and the box that it is."""
+"""Calls by which the product starts a process, and the box of each."""
 
 # ---------------------------------------------------------------------- what the source says
 

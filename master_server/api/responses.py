@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What readers are told of the map, the units and the coverage: the same fields whether they ask or listen."""
+"""Answers about the map, the units and the coverage: the same fields for requests and for the stream."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from shared.messages import LatticeDescription, Reason, VoxelsAnswer
 Form = Literal["indices", "centres", "keys"]
 
 CENTRE_DECIMALS = 4
-"""Centres to a tenth of a millimetre, a hundredth of the smallest voxel."""
+"""Decimals of centres: a tenth of a millimetre, a hundredth of the smallest voxel."""
 
 MANY = 3
-"""Blocks are told apart by up to as many units; with three, a hidden one and a dead one still leave one."""
+"""Blocks seen by this many units or more are counted together; with three, one may be hidden and one dead."""
 
 
 class StreamMessage(VoxelsAnswer):
@@ -32,14 +32,14 @@ class StreamMessage(VoxelsAnswer):
 
 
 class BlockCounts(LatticeDescription):
-    """How many units see each block: `np.repeat(counts, runs).reshape(shape)`, in C order."""
+    """Number of units that see each block: `np.repeat(counts, runs).reshape(shape)`, in C order."""
 
     counts: list[int]
     runs: list[int]
 
 
 class CoverageAnswer(BaseModel):
-    """`GET /coverage`: how much of the cell is looked through now."""
+    """`GET /coverage`: share of the cell that is looked through now."""
 
     shares: list[float] = Field(description="Share of the blocks seen by 0, 1, 2, and 3 or more live units.")
     seen_share: float = Field(description="Share of the blocks seen by any.")
@@ -54,7 +54,7 @@ class CoverageAnswer(BaseModel):
 
 
 def map_fields(view: MapView, form: Form, unseen: dict[str, Any] | None, now_ns: int) -> dict[str, Any]:
-    """The fields of `VoxelsAnswer`, as plain numbers and lists but for the voxels, which are arrays."""
+    """Return the fields of `VoxelsAnswer` as plain numbers and lists, except the voxels, which are arrays."""
     return {
         "lattice": LatticeDescription.of(view.lattice).model_dump(),
         "lattice_version": view.lattice_version,
@@ -71,18 +71,18 @@ def map_fields(view: MapView, form: Form, unseen: dict[str, Any] | None, now_ns:
 
 
 def unseen_fields(blocks: Lattice, seen_by: NDArray[np.uint8]) -> dict[str, Any]:
-    """The blocks (nx, ny, nz) that nobody looks through, by their indices."""
+    """Return the blocks (nx, ny, nz) that no live unit looks through, by their indices."""
     return {**LatticeDescription.of(blocks).model_dump(), "blocks": np.ascontiguousarray(np.argwhere(seen_by == 0))}
 
 
 def coverage_shares(seen_by: NDArray[np.uint8]) -> list[float]:
-    """Shares of the blocks seen by 0, 1, ... and `MANY` or more units; they sum to 1."""
+    """Return the shares of the blocks seen by 0, 1, ... and `MANY` or more units; they sum to 1."""
     counts = np.bincount(np.minimum(seen_by, MANY).ravel(), minlength=MANY + 1)
     return [float(count) / seen_by.size for count in counts]
 
 
 def coverage_fields(master: Readable, with_blocks: bool, now_ns: int) -> dict[str, Any]:
-    """The fields of `CoverageAnswer`."""
+    """Return the fields of `CoverageAnswer`."""
     view, seen_by, blocks = master.view(now_ns), master.seen_by(now_ns), master.blocks_at(now_ns)
     shares = coverage_shares(seen_by)
     return {
@@ -100,12 +100,12 @@ def coverage_fields(master: Readable, with_blocks: bool, now_ns: int) -> dict[st
 
 
 def as_json(fields: dict[str, Any]) -> bytes:
-    """Compact JSON. Arrays are written as they lie: by way of lists all updates would wait 40 ms for 15,000 centres."""
+    """Encode as compact JSON. Arrays are not made lists first: all updates would wait 40 ms for 15,000 centres."""
     return orjson.dumps(fields, option=orjson.OPT_SERIALIZE_NUMPY)
 
 
 def as_msgpack(fields: dict[str, Any]) -> bytes:
-    """The same as msgpack."""
+    """Encode as msgpack."""
     return ormsgpack.packb(fields, option=ormsgpack.OPT_SERIALIZE_NUMPY)
 
 

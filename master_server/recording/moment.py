@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording holds besides the pictures for people: all that the master answered, without loss.
+"""The records of a recording, besides the channels that are drawn: all that the master answered, without loss.
 
 A recording is an MCAP file. Its own channels are JSON with a JSON schema; arrays are bytes in base64:
 
-    /cellwatch/state      `StateRecord`   ten times a second: what changes with time alone
+    /cellwatch/state      `StateRecord`   ten times a second: ages, states and reasons
     /cellwatch/map        `MapRecord`     when it changed
     /cellwatch/seen       `SeenRecord`    when it changed
     /cellwatch/settings   `Settings`      when they changed
 
-The latter three are written at the beginning of each chunk too, so that any chunk can be understood by itself.
+The latter three are written at the beginning of each chunk as well, so that every chunk can be read by itself.
 Cells and meshes are attachments, named by their sha256. Log times are nanoseconds since 1970.
 """
 
@@ -42,7 +42,7 @@ FORMAT_MAJOR, FORMAT_MINOR = 1, 1
 new names or codes, which an older reader ignores. Recordings of 1.0 say `1`."""
 
 METADATA = "cellwatch"
-"""Name of the metadata record that tells the format."""
+"""Name of the metadata record that holds the format."""
 
 STATE_TOPIC = "/cellwatch/state"
 MAP_TOPIC = "/cellwatch/map"
@@ -51,17 +51,17 @@ SETTINGS_TOPIC = "/cellwatch/settings"
 
 
 def cell_attachment(sha256: str) -> str:
-    """Name of the attachment that is a cell's document."""
+    """Return the name of the attachment with a cell's document."""
     return f"cells/{sha256}"
 
 
 def mesh_attachment(sha256: str) -> str:
-    """Name of the attachment that is a mesh in its canonical bytes."""
+    """Return the name of the attachment with a mesh in its canonical bytes."""
     return f"meshes/{sha256}"
 
 
 class Moment(NamedTuple):
-    """What the master knew at `at_ns` of its clock. Nothing in it changes afterwards."""
+    """The master's state at `at_ns` of its clock. Immutable."""
 
     at_ns: int
     view: MapView
@@ -75,7 +75,7 @@ class Moment(NamedTuple):
 
 
 def moment_of(master: Master, now_ns: int) -> Moment:
-    """What the master knows now."""
+    """Return the master's state at `now_ns`."""
     return Moment(
         now_ns,
         master.view(now_ns),
@@ -113,7 +113,7 @@ def _recorded_robot(robot: object) -> object:
 
 
 class StateRecord(Record):
-    """What changes with time alone: ages, states, reasons. `at_ns` is by the master's clock.
+    """Ages, states and reasons, which change with time alone. `at_ns` is by the master's clock.
 
     `causes` are the reasons for programs; older recordings have none.
     """
@@ -131,7 +131,7 @@ class StateRecord(Record):
 
     @classmethod
     def of(cls, moment: Moment) -> StateRecord:
-        """The record of a moment."""
+        """Make the record of a moment."""
         view = moment.view
         return cls(
             at_ns=moment.at_ns,
@@ -161,7 +161,7 @@ class MapRecord(Record):
 
     @classmethod
     def of(cls, view: MapView) -> MapRecord:
-        """The record of a map."""
+        """Make the record of a map."""
         return cls(
             lattice=LatticeDescription.of(view.lattice),
             lattice_version=view.lattice_version,
@@ -171,20 +171,20 @@ class MapRecord(Record):
         )
 
     def arrays(self) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
-        """Keys (N,) and witnesses (N,).
+        """Return keys (N,) and witnesses (N,).
 
         Raises:
-            InputError: they are not as many.
+            InputError: their numbers differ.
         """
         if len(self.keys) != 4 * len(self.witnesses):
             raise InputError(f"map: expected 4 bytes a witness, got {len(self.keys)} and {len(self.witnesses)}")
         return np.frombuffer(self.keys, "<u4"), np.frombuffer(self.witnesses, np.uint8)
 
     def reported(self) -> dict[int, NDArray[np.uint32]]:
-        """Keys (N,) of each unit.
+        """Return the keys (N,) of each unit.
 
         Raises:
-            InputError: they are no whole number of keys.
+            InputError: the bytes of a unit are not a whole number of keys.
         """
         for unit_id, keys in self.reports.items():
             if len(keys) % 4:
@@ -193,21 +193,21 @@ class MapRecord(Record):
 
 
 class SeenRecord(Record):
-    """How many live units looked through each block: uint8 in C order."""
+    """Number of live units that looked through each block: uint8 in C order."""
 
     blocks: LatticeDescription
     seen_by: bytes
 
     @classmethod
     def of(cls, moment: Moment) -> SeenRecord:
-        """The record of what is seen at a moment."""
+        """Make the record of the seen blocks at a moment."""
         return cls(blocks=LatticeDescription.of(moment.blocks), seen_by=moment.seen_by.tobytes())
 
     def counts(self) -> NDArray[np.uint8]:
-        """The counts in the blocks' shape.
+        """Return the counts in the shape of the blocks.
 
         Raises:
-            InputError: they are not as many as there are blocks.
+            InputError: there are more or fewer counts than blocks.
         """
         counts = np.frombuffer(self.seen_by, np.uint8)
         if counts.size != np.prod(self.blocks.shape):

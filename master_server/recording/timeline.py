@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files of one recording as one timeline, in the memory of one of them."""
+"""The files of one recording as one timeline; only one of them is unpacked at a time."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from shared.clock import NS_PER_S
 from shared.errors import SourceError
 
 FILES_MAX = 1024
-"""Of one timeline: a week in files of ten minutes; each is held open."""
+"""Limit of files in one timeline: a week in files of ten minutes. Each file is held open."""
 
 GAP_MAX_S = 10.0
-"""Between two files of one recording: a chunk that was lost with its writer and a step of the wall clock pass."""
+"""Largest gap between two files of one recording; allows for a lost chunk and a step of the wall clock."""
 
 
 class Timeline:
-    """Rotated files of one recording, in any order; a context, which closes them. As `Recording`, for all of them.
+    """Rotated files of one recording, in any order, with the interface of `Recording`. A context manager closes them.
 
     Attributes:
         begin_ns, end_ns: of the first and the last moment, since 1970.
@@ -32,10 +32,10 @@ class Timeline:
     """
 
     def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
-        """Open all `paths`. `progress` is called with the bytes read and those in all.
+        """Open all `paths`. `progress` receives the bytes read and the total.
 
         Raises:
-            SourceError: one cannot be read or holds no moment, or they are not of one recording.
+            SourceError: a file cannot be read or holds no moment, or the files are not of one recording.
         """
         if not 1 <= len(paths) <= FILES_MAX:
             raise SourceError(f"replay: expected 1 to {FILES_MAX} files, got {len(paths)}")
@@ -47,7 +47,7 @@ class Timeline:
             self._stack = stack.pop_all()
         self.begin_ns, self.end_ns = self.files[0].begin_ns, max(file.end_ns for file in self.files)
         self._current = self.files[0]
-        # Each file holds all that it needs; the newest one with it is as good as another.
+        # Each file holds every mesh that it needs, so any file that has it will do.
         self._cells = {sha256: file for file in self.files for sha256 in file.cell_names}
         self._meshes = {sha256: file for file in self.files for sha256 in file.meshes}
 
@@ -59,17 +59,17 @@ class Timeline:
 
     @property
     def path(self) -> Path:
-        """The file that was asked last."""
+        """The file that was used last."""
         return self._current.path
 
     @property
     def trouble(self) -> str:
-        """Why there may be less than was recorded, empty when nothing is missing."""
+        """Reason why moments may be missing; empty when nothing is missing."""
         return "; ".join(f"{file.path.name}: {file.trouble}" for file in self.files if file.trouble)
 
     @property
     def counts(self) -> dict[str, int]:
-        """Messages by topic."""
+        """Number of messages by topic."""
         total: Counter[str] = Counter()
         for file in self.files:
             total.update(file.counts)
@@ -77,40 +77,40 @@ class Timeline:
 
     @property
     def size_bytes(self) -> int:
-        """Size of all files."""
+        """Size of all files, bytes."""
         return sum(file.size_bytes for file in self.files)
 
     @property
     def cells(self) -> list[dict[str, Any]]:
-        """The documents of all cells that were watched, each once."""
+        """Documents of all cells that were watched, each once."""
         return [file.cell(sha256) for sha256, file in self._cells.items()]
 
     @property
     def meshes(self) -> list[str]:
-        """The sha256 of all meshes."""
+        """sha256 of all meshes."""
         return list(self._meshes)
 
     def at(self, log_ns: int) -> Frame:
-        """The last moment that is not after `log_ns`; the first one, if that is earlier."""
+        """Return the last moment at or before `log_ns`, or the first moment if `log_ns` is earlier."""
         return self._file(log_ns).at(log_ns)
 
     def after(self, log_ns: int) -> int | None:
-        """The time of the first moment after `log_ns`."""
+        """Return the time of the first moment after `log_ns`."""
         for file in self.files[self._number(log_ns) :]:
             if (found := file.after(log_ns)) is not None:
                 return found
         return None
 
     def cell(self, sha256: str) -> dict[str, Any]:
-        """The document of a cell.
+        """Return the document of a cell.
 
         Raises:
-            SourceError: it is missing or damaged.
+            SourceError: the document is missing or damaged.
         """
         return self._cells.get(sha256, self._current).cell(sha256)
 
     def mesh(self, sha256: str) -> bytes | None:
-        """A mesh in its canonical bytes, if it is there."""
+        """Return a mesh in its canonical bytes; None if it is missing."""
         holder = self._meshes.get(sha256)
         return None if holder is None else holder.mesh(sha256)
 
@@ -154,12 +154,12 @@ def _begin_of(file: Recording) -> int:
 
 
 def duration_s(timeline: Timeline) -> float:
-    """Seconds from the first moment to the last."""
+    """Return the seconds from the first moment to the last."""
     return (timeline.end_ns - timeline.begin_ns) / NS_PER_S
 
 
 def summary(timeline: Timeline) -> list[str]:
-    """What is in a recording, in lines for a person."""
+    """Describe the contents of a recording in lines for a person."""
     first, last = timeline.at(timeline.begin_ns), timeline.at(timeline.end_ns)
     lines = [
         f"{', '.join(str(file.path) for file in timeline.files)}: {timeline.size_bytes / 1e6:.1f} MB",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table, plots and controls beside the picture; what units say of themselves is text and never markup."""
+"""The table, plots and controls beside the scene. Texts of units are escaped, and never markup."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ from shared.messages import Progress, UnitRow
 from shared.settings import Settings
 
 ACTION_S = 5.0
-"""For what an operator's own action posts to."""
+"""Timeout of an operator's own action."""
 
 PLOT_PADDING_PX = (12, 16, 0, 8)
-"""Above, right, below and left of a plot."""
+"""Padding above, right of, below and left of a plot."""
 
 SENTENCE_CHARS = 300
 
 SHOWN_S = 12.0
-"""A refusal stays to be read."""
+"""Time for which a refusal is shown."""
 
 STYLE = """<style>
 .cw{font:12px/1.45 system-ui,sans-serif;padding:0 .6em}.cw table{width:100%;border-collapse:collapse}
@@ -66,7 +66,7 @@ SETTINGS = (
     ("occupancy_threshold", "threshold", 0.05, 2.0, 0.05),
     ("stale_after_s", "stale after [s]", 0.05, 60.0, 0.05),
 )
-"""Name, label, least, most and step; the other settings are for `PUT /settings`."""
+"""Name, label, minimum, maximum and step; other settings are changed by `PUT /settings`."""
 
 COMMANDS = (
     ("Find by the board", "POST", "/calibrate", ""),
@@ -86,42 +86,42 @@ COMMANDS = (
         "back as a new unit without a pose.",
     ),
 )
-"""What a button says, what it asks of `/units/ID`, and what is lost by it: then it asks once more."""
+"""Label, method, path after `/units/ID`, and what is lost; a command that loses something asks for confirmation."""
 
 COLOURINGS = BY_WITNESSES, BY_UNIT = "number of units", "unit"
-"""What the colours of voxels may tell."""
+"""Meanings of the voxels' colours."""
 
 
-def status_html(told: ViewerState) -> str:
-    """Whether the map is all there is, and why not."""
-    replayed = told.replay
+def status_html(state: ViewerState) -> str:
+    """Return the status: whether the map is complete, and the reasons if not."""
+    replayed = state.replay
     lines = []
     if replayed:
-        state = "playing" if replayed.playing else "paused"
+        playing = "playing" if replayed.playing else "paused"
         lines.append(
             f"<b>recording</b> {html.escape(replayed.file)}, {replayed.position_s:.1f} of "
-            f"{replayed.duration_s:.1f} s{_of_files(replayed.files)}, {state}"
+            f"{replayed.duration_s:.1f} s{_of_files(replayed.files)}, {playing}"
         )
-    voxels = told.map.count
-    age_s = told.oldest_view_age_s
+    voxels = state.map.count
+    age_s = state.oldest_view_age_s
     age = "" if age_s is None else f", oldest view {age_s * 1000:.0f} ms"
-    units = f"{told.units_live} unit{'' if told.units_live == 1 else 's'} live"
+    units = f"{state.units_live} unit{'' if state.units_live == 1 else 's'} live"
     lines.append(f"<b>{voxels}</b> obstacle voxels, {units}{age}")
-    if told.reasons:
+    if state.reasons:
         colour = _css("blind")
         lines.append(f'<b style="color:{colour}">The map is not complete:</b>')
-        lines += [html.escape(reason) for reason in told.reasons]
-        more = told.reason_count - len(told.reasons)
+        lines += [html.escape(reason) for reason in state.reasons]
+        more = state.reason_count - len(state.reasons)
         lines += [f"and {more} more"] * (more > 0)
     else:
         lines.append(f'<b style="color:{_css("live")}">The map is complete.</b>')
-    if told.robot.state not in ("fresh", "none"):
-        lines.append(f"robot: {html.escape(told.robot.reason)}")
+    if state.robot.state not in ("fresh", "none"):
+        lines.append(f"robot: {html.escape(state.robot.reason)}")
     return f'{STYLE}<div class="cw" data-cellwatch="status">{"<br>".join(lines)}</div>'
 
 
 def table_html(rows: Sequence[UnitRow]) -> str:
-    """A row a unit, and below it why it is not live."""
+    """Return a table with a row for each unit, and below it the reason why it is not live."""
     heads = ("unit", "state", "age ms", "fps", "ms", "voxels", "valid", "fits")
     parts = [f"<tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr>"]
     for row in rows:
@@ -153,17 +153,17 @@ def table_html(rows: Sequence[UnitRow]) -> str:
     return f'{STYLE}<div class="cw" data-cellwatch="units"><table>{"".join(parts)}</table></div>'
 
 
-def legend_html(by_unit: bool, unit_ids: Sequence[int], is_told: bool) -> str:
-    """What the colours of voxels tell; `is_told` is whether who reports them is known at all."""
+def legend_html(by_unit: bool, unit_ids: Sequence[int], has_reports: bool) -> str:
+    """Return the legend of the voxels' colours; without `has_reports` the reporting units are not known."""
     entries: list[tuple[Colour, str]]
     if not by_unit:
         counts = ("1 unit", "2 units", f"{len(WITNESS_COLOURS)} or more")
         entries = list(zip(WITNESS_COLOURS, counts, strict=True))
-    elif is_told:
+    elif has_reports:
         entries = [(unit_colour(unit_id), f"unit {unit_id}") for unit_id in unit_ids]
         entries.append((SHARED_COLOUR, "several units"))
     else:
-        entries = [(SHARED_COLOUR, "not recorded: this recording tells how many units report a voxel, not which")]
+        entries = [(SHARED_COLOUR, "not recorded: only the number of units that report a voxel is known")]
     chips = "".join(
         f'<span style="white-space:nowrap"><i style="background:rgb{colour}"></i>{text}</span> '
         for colour, text in entries
@@ -172,7 +172,7 @@ def legend_html(by_unit: bool, unit_ids: Sequence[int], is_told: bool) -> str:
 
 
 def confirm_html(row: UnitRow, loss: str) -> str:
-    """Of which unit something would be lost, and what."""
+    """Return the question before a command that loses something: the unit, and the loss."""
     unit = html.escape(f"unit {row.id} · {row.ip}, camera {row.serial}")
     return f'{STYLE}<div class="cw" data-cellwatch="confirm" style="padding-bottom:.8em"><b>{unit}</b><br>{loss}</div>'
 
@@ -182,7 +182,7 @@ def _of_files(count: int) -> str:
 
 
 def _progress_html(progress: Progress | None) -> str:
-    """How far a unit has come with what is to be waited for; empty where it tells nothing of the kind."""
+    """Return a bar for the progress of a unit's task; empty without a task."""
     if progress is None:
         return ""
     return f'<progress value="{progress.done}" max="{progress.total}"></progress>'
@@ -193,13 +193,13 @@ def _css(state: str) -> str:
 
 
 def _curve(points: list[tuple[int, float]], offset_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times (N,) in seconds and values (N,) to be plotted; `offset_s` is added to the times, which are nanoseconds."""
+    """Return times (N,) in seconds, `offset_s` later than the given nanoseconds, and values (N,) for a plot."""
     at_ns, values = np.array(points or [(0, 0.0)], np.float64).T
     return at_ns / NS_PER_S + offset_s, values
 
 
 class Panel:
-    """What all who look see alike beside the picture."""
+    """The part of the panel that is the same for all viewers."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._history: deque[Sample] = deque(maxlen=SAMPLES_MAX)
@@ -217,24 +217,24 @@ class Panel:
 
     @property
     def known_ns(self) -> int:
-        """When the newest sample of the history was taken that is shown."""
+        """Time of the newest history sample that is shown."""
         return self._history[-1].at_ns if self._history else -1
 
-    def show(self, told: ViewerState, wall_s: float) -> None:
-        """The newest, with units."""
-        self._status.content = status_html(told)
-        self._table.content = table_html(told.units or ())
-        if not told.history:
+    def show(self, state: ViewerState, wall_s: float) -> None:
+        """Show the newest state, with its units."""
+        self._status.content = status_html(state)
+        self._table.content = table_html(state.units or ())
+        if not state.history:
             return
-        self._history.extend(told.history)
-        offset_s = wall_s - told.now_ns / NS_PER_S
+        self._history.extend(state.history)
+        offset_s = wall_s - state.now_ns / NS_PER_S
         self._voxels.data = _curve([(sample.at_ns, float(sample.voxels)) for sample in self._history], offset_s)
-        # A gap cannot be drawn: one value that is no number, and nothing of the curve is.
+        # The plot draws nothing at all of a curve with a NaN, so a gap is left out.
         ages_s = [(sample.at_ns, sample.oldest_view_age_s) for sample in self._history]
         self._age.data = _curve([(at_ns, 1000.0 * age_s) for at_ns, age_s in ages_s if age_s is not None], offset_s)
 
     def say(self, text: str) -> None:
-        """Something stands in place of the status."""
+        """Show a text in place of the status."""
         self._status.content = f'{STYLE}<div class="cw" data-cellwatch="status">{html.escape(text)}</div>'
 
     @staticmethod
@@ -247,70 +247,70 @@ class Panel:
             scales={"x": {"time": True}, "y": {"auto": True}},
             legend={"show": False},
             aspect=2.4,
-            # Or else the uppermost number of an axis is cut in half.
+            # Without it the uppermost number of an axis is cut in half.
             padding=PLOT_PADDING_PX,
         )
 
 
 class Player:
-    """The controls of a recording, and where the slider was last moved to."""
+    """The controls of a recording, and the last position of the slider."""
 
     def __init__(self, gui: viser.GuiApi, change: Callable[[dict[str, object]], None]) -> None:
-        """`change` is handed what is wanted of the replay."""
+        """Call `change` with each request of the user for the replay."""
         self._change = change
         self._wanted_s: float | None = None
         with gui.add_folder("Recording", order=0.5):
             self._playing: Any = gui.add_checkbox("play", True)
             self._speed = gui.add_dropdown("speed", ("0.1", "0.25", "0.5", "1", "2", "5", "10"), initial_value="1")
             self._position: Any = gui.add_slider("time [s]", min=0.0, max=1.0, step=0.01, initial_value=0.0)
-        self._playing.on_update(lambda event: self._hear(event, self._play))
-        self._speed.on_update(lambda event: self._hear(event, self._hurry))
-        self._position.on_update(lambda event: self._hear(event, self._move))
+        self._playing.on_update(lambda event: self._if_by_user(event, self._play))
+        self._speed.on_update(lambda event: self._if_by_user(event, self._set_speed))
+        self._position.on_update(lambda event: self._if_by_user(event, self._move))
 
     def show(self, replayed: ReplayAnswer) -> None:
-        """How it stands, unless somebody is moving the slider."""
+        """Show the state of the replay, except while the slider is being moved."""
         if self._wanted_s is None:
             self._position.max = max(replayed.duration_s, 0.1)
             self._position.value = min(replayed.position_s, self._position.max)
             self._playing.value = replayed.playing
 
     def go(self) -> None:
-        """Go where the slider was last moved to."""
+        """Move the replay to the last position of the slider."""
         wanted_s, self._wanted_s = self._wanted_s, None
         if wanted_s is not None:
             self._change({"position_s": wanted_s})
 
     @staticmethod
-    def _hear(event: Any, do: Callable[[], None]) -> None:
-        # What the program itself set comes from nobody.
+    def _if_by_user(event: Any, do: Callable[[], None]) -> None:
+        # A value that the program itself set has no client.
         if event.client is not None:
             do()
 
     def _play(self) -> None:
         self._change({"playing": bool(self._playing.value)})
 
-    def _hurry(self) -> None:
+    def _set_speed(self) -> None:
         self._change({"speed": float(self._speed.value)})
 
     def _move(self) -> None:
-        # A hand that moves it says a hundred places a second; the last one is where it goes.
+        # A moving slider reports a hundred positions a second; only the last one counts.
         self._wanted_s = float(self._position.value)
 
 
 class ClientPanel:
-    """One who looks: what is theirs alone, and what they may do."""
+    """The part of the panel that belongs to one browser: its choices, and the commands that its role may use."""
 
     def __init__(
         self,
         client: viser.ClientHandle,
         viewer: Viewer,
-        asker: MasterChannel,
+        channel: MasterChannel,
         actions: dict[str, str],
         is_replay: bool,
     ) -> None:
         self.client = client
         self.viewer = viewer
-        self._asker = asker
+        self._channel = channel
         self._units: dict[str, UnitRow] = {}
         self._unseen = UnseenLayer(client)
         self._ranges = RangeLayer(client)
@@ -335,39 +335,39 @@ class ClientPanel:
 
     @property
     def wants_unseen(self) -> bool:
-        """Whether they want to see what nobody sees."""
+        """True if the unseen blocks are shown."""
         return bool(self._wants_unseen.value)
 
     @property
     def wants_by_unit(self) -> bool:
-        """Whether colours are to tell them which unit reports a voxel."""
+        """True if colours show the reporting unit."""
         return bool(self._colouring.value == BY_UNIT)
 
     def draw(self, voxels: Voxels) -> None:
-        """Obstacles, in the colours that they want."""
+        """Draw the obstacle voxels in the chosen colours."""
         self._voxels.show(voxels, self.wants_by_unit)
 
-    def show(self, told: ViewerState) -> None:
-        """The newest, with units."""
-        rows = told.units or ()
+    def show(self, state: ViewerState) -> None:
+        """Show the newest state, with its units."""
+        rows = state.units or ()
         units = {f"{row.id} · {row.ip}": row for row in rows}
         if units.keys() != self._units.keys():
             self._unit.options = tuple(units) or ("none",)
         self._units = units
-        self._legend.content = legend_html(self.wants_by_unit, [row.id for row in rows], told.map.has_reports)
+        self._legend.content = legend_html(self.wants_by_unit, [row.id for row in rows], state.map.has_reports)
         if self._wants_ranges.value:
             self._ranges.show(rows)
         else:
             self._ranges.hide()
-        if self.wants_unseen and told.seen is not None:
-            self._unseen.show(told.seen.bits, told.seen.blocks.lattice())
+        if self.wants_unseen and state.seen is not None:
+            self._unseen.show(state.seen.bits, state.seen.blocks.lattice())
         elif not self.wants_unseen:
             self._unseen.hide()
-        if told.replay is not None and self._player is not None:
-            self._player.show(told.replay)
+        if state.replay is not None and self._player is not None:
+            self._player.show(state.replay)
 
     def go(self) -> None:
-        """Go where the slider was last moved to."""
+        """Move the replay to the last position of the slider."""
         if self._player is not None:
             self._player.go()
 
@@ -403,7 +403,7 @@ class ClientPanel:
         self._fetch(method, f"/units/{self._chosen().id}{path}")
 
     def _confirm(self, label: str, loss: str, method: str, path: str) -> None:
-        """Ask once more, of the unit that is chosen now."""
+        """Ask for confirmation, for the unit that is chosen now."""
         row = self._chosen()
         gui = self.client.gui
         modal = gui.add_modal(f"{label}?")
@@ -435,7 +435,7 @@ class ClientPanel:
 
     def _fetch(self, method: str, path: str, body: object = None) -> bytes:
         request = ApiRequest(method=method, path=path, body=body, viewer=self.viewer)
-        answer = self._asker.request(request, ApiAnswer)
+        answer = self._channel.request(request, ApiAnswer)
         if answer.status >= 400:
             raise Refusal(answer.status, _detail(answer.body))
         return answer.body
@@ -464,7 +464,7 @@ class ClientPanel:
 
 
 def contact_sheet(images: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Three pictures (H, W, 3) as one: two beside each other and the third below."""
+    """Join three images (H, W, 3): two beside each other and the third below."""
     first, second, third = images
     height, width, _ = first.shape
     sheet = np.zeros((2 * height, 2 * width, 3), np.uint8)
@@ -474,7 +474,7 @@ def contact_sheet(images: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
 
 
 def _detail(body: bytes) -> str:
-    """The sentence of a refusal."""
+    """Return the sentence of a refusal."""
     try:
         return str(json.loads(body)["detail"])
     except (ValueError, KeyError, TypeError):

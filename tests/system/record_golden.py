@@ -40,7 +40,7 @@ TROUBLES: dict[str, dict[str, Any]] = {
     "learns the background": {"trouble_code": "background", "progress": Progress(task="background", done=3, total=60)},
     "gets joints": {"progress": Progress(task="refinement", done=9, total=30)},
 }
-"""What a unit of 5.1 says beside the trouble of some steps."""
+"""Fields of the health that a unit of 5.1 adds in some steps."""
 
 PRAGMAS = ("application_id", "user_version")
 

@@ -49,7 +49,7 @@ REOPEN_MIN_S = 0.2
 REOPEN_MAX_S = 5.0
 """Between attempts to open a camera that does not deliver."""
 
-REHEARSAL_S = 5.0
+WARM_UP_S = 5.0
 """For kernels to be read from disk, on a busy machine."""
 
 FRAME_S_MAX = 5.0
@@ -100,21 +100,21 @@ class Unit:
         self._camera = CameraStatus(config, self.uplink)
         self._trace = None if config.trace_path is None else Trace(config.trace_path)
         self._search = BoardSearch(source, config.board_stream, clock)
-        self._work = self._frame_work()
-        self._errands = TaskGroup()
-        self._showing = ImageRequests(self.uplink, self._work.assigned, self._errands)
+        self._processor = self._make_processor()
+        self._tasks = TaskGroup()
+        self._images = ImageRequests(self.uplink, self._processor.assigned, self._tasks)
         self._progress = StallDetector(clock)
-        self._rehearsal: asyncio.Task[None] | None = None
+        self._warm_up: asyncio.Task[None] | None = None
         self._limiter = FrameLimiter(config.fps_max)
         self._status = UnitStatus(clock)
 
-    def _frame_work(self) -> FrameProcessor:
+    def _make_processor(self) -> FrameProcessor:
         config, finish = self._config, self.uplink.finish
-        stance = PoseMonitor(config.state_dir)
+        pose_monitor = PoseMonitor(config.state_dir)
         learning = BackgroundLearning(BackgroundStore(config.state_dir), config.learn_background_frames, finish)
-        assigned = AssignedPipeline(learning, stance)
-        refining = RefinementTask(self.uplink, assigned, stance)
-        return FrameProcessor(finish, assigned, learning, refining, stance, FrameJoints(self.uplink))
+        assigned = AssignedPipeline(learning, pose_monitor)
+        refinement = RefinementTask(self.uplink, assigned, pose_monitor)
+        return FrameProcessor(finish, assigned, learning, refinement, pose_monitor, FrameJoints(self.uplink))
 
     async def run(self) -> None:
         """Watch and report.
@@ -135,7 +135,7 @@ class Unit:
                 for task in tasks:
                     task.cancel()
                 results = await asyncio.gather(*tasks, return_exceptions=True)
-                await self._errands.end()
+                await self._tasks.end()
                 if self._trace is not None:
                     await asyncio.to_thread(self._trace.close)
             for result in results:
@@ -148,7 +148,7 @@ class Unit:
         """One line for a person: camera, frames a second since it was asked last, master."""
         trouble = self.uplink.camera_state.trouble
         line = self._status.line(None if trouble is None else trouble.sentence)
-        return f"{line}; {self.uplink.standing}"
+        return f"{line}; {self.uplink.status_text}"
 
     def stuck(self) -> str | None:
         """What hangs and will not come to its end by itself; waiting for a camera or a master is not of that kind."""
@@ -182,87 +182,89 @@ class Unit:
             retry_s = min(2.0 * retry_s, REOPEN_MAX_S)
 
     async def _open(self) -> None:
-        if self._rehearsal is None:
-            self._rehearsal = asyncio.create_task(asyncio.to_thread(self._rehearse))
+        if self._warm_up is None:
+            self._warm_up = asyncio.create_task(asyncio.to_thread(self._run_warm_up))
         camera = await self._source.open()
         # Who registers is live with the next frame; but a unit that has to compile first tells that it is there.
-        await done_within(REHEARSAL_S, self._rehearsal, self._clock)
-        self._work.assigned.open(camera)
+        await done_within(WARM_UP_S, self._warm_up, self._clock)
+        self._processor.assigned.open(camera)
         await self._camera.opened(camera)
-        await asyncio.gather(self.uplink.assigned.wait(), self._rehearsal)
+        await asyncio.gather(self.uplink.assigned.wait(), self._warm_up)
         assignment = self.uplink.assignment
         if assignment is not None and assignment.T_world_camera is not None:
             # Before the camera delivers, so that no frame has to wait for what is compiled and drawn only once.
             # What cannot be prepared is told with each frame, for the master may change it.
             with suppress(InputError), self._progress.working("preparing for frames", PREPARE_S_MAX):
-                await asyncio.to_thread(self._work.assigned.prepare, assignment, assignment.T_world_camera)
+                await asyncio.to_thread(self._processor.assigned.prepare, assignment, assignment.T_world_camera)
 
-    def _rehearse(self) -> None:
+    def _run_warm_up(self) -> None:
         with self._progress.working("compiling the kernels", PREPARE_S_MAX):
             warm_up_kernels()
 
     async def _end(self) -> None:
         """A recording has no more frames."""
         await self.uplink.drained(DRAIN_S)
-        if self._work.learning.progress is None:
+        if self._processor.learning.progress is None:
             logger.info("the recording has come to its end")
         else:
-            logger.warning("the recording ended after %d of the %d frames to be learned", *self._work.learning.progress)
+            logger.warning(
+                "the recording ended after %d of the %d frames to be learned", *self._processor.learning.progress
+            )
 
     # ------------------------------------------------------------------ a frame
 
     async def _take(self, frame: DepthFrame) -> None:
-        """Do with one frame what its time, the master's assignment and its orders ask for."""
+        """Do with one frame what its time, the master's assignment and its batch ask for."""
         if not self._limiter.due(frame.captured_at_ns):
             return
-        assignment = self.uplink.assignment or self._work.assigned.assignment
+        assignment = self.uplink.assignment or self._processor.assigned.assignment
         if assignment is None:
             return
-        orders = CommandBatch.take(self.uplink.commands)
-        if orders.calibrations:
-            put_back(self.uplink.commands, (*orders.changes, *orders.pictures))
+        batch = CommandBatch.take(self.uplink.commands)
+        if batch.calibrations:
+            put_back(self.uplink.commands, (*batch.changes, *batch.images))
             # The frame is of before the look, and its memory may be gone afterwards.
             outcome = await localise(self._search, self.uplink, assignment, frame)
-            self._finish(orders.calibrations, outcome)
+            self._finish(batch.calibrations, outcome)
         elif assignment.T_world_camera is None:
-            await self._look_for_pose(assignment, frame, orders)
+            await self._search_pose(assignment, frame, batch)
         else:
-            await self._filter(assignment, assignment.T_world_camera, frame, orders)
+            await self._filter(assignment, assignment.T_world_camera, frame, batch)
 
-    async def _look_for_pose(self, assignment: Assignment, frame: DepthFrame, orders: CommandBatch) -> None:
+    async def _search_pose(self, assignment: Assignment, frame: DepthFrame, batch: CommandBatch) -> None:
         """Say that nobody knows where the camera stands, and look for the board now and then."""
-        self._work.assigned.pipeline = None
-        self._finish(orders.changes, Outcome("refused", NO_POSE))
+        self._processor.assigned.pipeline = None
+        self._finish(batch.changes, Outcome("refused", NO_POSE))
         seen = self._search.outcome
         searching = Trouble("board", f"searching for the board: {seen}") if seen else None
         report = troubled(assignment, frame, searching)
         self._status.note_trouble(report.health.trouble or NO_POSE)
         self.uplink.offer(report)
-        await self._showing.show(orders.pictures, frame, None)
+        await self._images.show(batch.images, frame, None)
         wanted = self._config.localise and assignment.cell.board is not None
         if wanted and self._search.due:
             await localise(self._search, self.uplink, assignment, frame)
 
     async def _filter(
-        self, assignment: Assignment, T_world_camera: Transform, frame: DepthFrame, orders: CommandBatch
+        self, assignment: Assignment, T_world_camera: Transform, frame: DepthFrame, batch: CommandBatch
     ) -> None:
         """Process the frame and offer the result; nothing that follows delays it."""
         stages = StageTimer(frame.captured_at_ns, self._clock)
         stages.end("source")
-        joints = await self._work.joints.at(assignment, frame)
+        joints = await self._processor.joints.at(assignment, frame)
         stages.end("joints")
-        prepared = assignment is self._work.assigned.assignment and not orders.changes and not orders.pictures
+        prepared = assignment is self._processor.assigned.assignment and not batch.changes and not batch.images
         with self._progress.working(f"frame {frame.frame_number}", FRAME_S_MAX if prepared else PREPARE_S_MAX):
             if self._trace is not None:
                 await asyncio.to_thread(self._trace.flush)
             report = await asyncio.to_thread(
-                self._work.process, assignment, T_world_camera, frame, joints, orders.changes, stages
+                self._processor.process, assignment, T_world_camera, frame, joints, batch.changes, stages
             )
         self._status.note_frame(report.health.trouble)
         self.uplink.offer(report)
-        await self._showing.show(orders.pictures, frame, joints)
-        for task in self._work.afterwards(frame, joints, report):
-            self._errands.start(task)
+        await self._images.show(batch.images, frame, joints)
+        for task in self._processor.afterwards(frame, joints, report):
+            self._tasks.start(task)
 
     def _finish(self, commands: list[Command], outcome: Outcome) -> None:
         for command in commands:

@@ -38,17 +38,17 @@ class LatestAssignment:
 
     def __init__(self) -> None:
         self.value: Assignment | None = None
-        self.there = asyncio.Event()
+        self.available = asyncio.Event()
 
     def set(self, assignment: Assignment) -> None:
         """Work with `assignment` from the next frame on."""
         self.value = assignment
-        self.there.set()
+        self.available.set()
 
     def clear(self) -> None:
         """Have none until the unit has registered again."""
         self.value = None
-        self.there.clear()
+        self.available.clear()
 
 
 class Trouble(NamedTuple):

@@ -70,7 +70,7 @@ class MasterClient:
 
         `transport` carries the requests in place of a network. `tls` is what is asked of the master's certificate,
         see `trust`; without, a master at https is held against the CAs of the system. With `url` None there is no
-        master until `aim` names one.
+        master until `set_url` names one.
         """
         self._read_token = read_token
         self._tls = tls
@@ -88,12 +88,12 @@ class MasterClient:
             trust_env=False,
         )
         if url is not None:
-            self.aim(url)
+            self.set_url(url)
         # They would cost a hundred bytes in every update and tell the master nothing.
         for name in ("Accept", "Accept-Encoding", "Connection", "User-Agent"):
             del self._http.headers[name]
 
-    def aim(self, url: str) -> None:
+    def set_url(self, url: str) -> None:
         """Talk to the master at `url` from now on.
 
         Raises:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Looks for the master while it is not known or does not answer, and is silent while it does.
 
-A place is only taken when somebody listens there who passes for the master: with `master_ca` or `master_fingerprint`
+An address is only taken when somebody listens there who passes for the master: with `master_ca` or `master_fingerprint`
 that is a TLS handshake with the right certificate, and whoever fails it hears no more of us, not even a request.
 """
 
@@ -20,13 +20,13 @@ from edge_unit.config import UnitConfig
 from edge_unit.tls import tls_context
 from edge_unit.uplink.master_selection import (
     Candidate,
-    Kept,
-    Place,
-    Wanted,
+    LastMaster,
+    MasterAddress,
+    MasterCriteria,
     choose,
-    distrusted,
-    first_place,
     in_order,
+    initial_address,
+    is_ruled_out,
     objection,
 )
 from shared.clock import NS_PER_S
@@ -39,22 +39,22 @@ logger = logging.getLogger(__name__)
 LOST_S = 2.0
 """A master that is restarted is back sooner; then others are looked for."""
 
-LOOK_S = 2.0
+SEARCH_INTERVAL_S = 2.0
 """Between looks, unless somebody new is heard of."""
 
-HEAR_S = 1.0
+COLLECT_S = 1.0
 """From the first master that is heard of to the choice: others answer within a fifth of a second."""
 
-HEAR_FIRST_S = 2.0
+COLLECT_FIRST_S = 2.0
 """... where it is a choice among all cells, and for good: all are asked again after one second, and then after five."""
 
-REACH_S = 1.0
+CONNECT_TIMEOUT_S = 1.0
 """For a connection; a master on our own network takes a hundredth of it, a board that is busy ten times that."""
 
-VAIN_S = 30.0
+RETRY_AFTER_S = 30.0
 """Where a master was tried in vain it is not tried again so soon."""
 
-TELL_S = 10.0
+LOG_INTERVAL_S = 10.0
 """Between lines in the journal about what is found; anyone on the network could have us write them."""
 
 FILE_NAME = "master.json"
@@ -70,23 +70,23 @@ class MasterSearch:
             ConfigError: `master_ca` cannot be read or holds no certificate.
         """
         self._clock = clock
-        self._wanted = wanted_of(config)
+        self._criteria = criteria_of(config)
         self._source_address = config.source_address
         self._path = config.state_dir / FILE_NAME
-        self._kept = kept_of(config)
+        self._last_master = last_master_of(config)
         self._tls = config.tls() or tls_context()
-        self._place = first_place(self._wanted, self._kept)
+        self._address = initial_address(self._criteria, self._last_master)
         self._found = asyncio.Event()
         self._lost = asyncio.Event()
         self._silent_since_ns: int | None = None
         self._answered_once = False
-        self._vain: dict[str, int] = {}
+        self._failed_at_ns: dict[str, int] = {}
         self._cells: set[str] = set()
         # The last line in the journal, and its time.
-        self._logged = "", clock.now_ns() - round(TELL_S * NS_PER_S)
+        self._logged = "", clock.now_ns() - round(LOG_INTERVAL_S * NS_PER_S)
         self.outcome = "no master is configured, and none was known before"
         """What was found last, in words."""
-        if self._place is None:
+        if self._address is None:
             self._lost.set()
 
     @property
@@ -94,28 +94,28 @@ class MasterSearch:
         """Whether it looks."""
         return self._lost.is_set()
 
-    async def place(self) -> Place:
+    async def address(self) -> MasterAddress:
         """Where to turn to now; waits while nobody knows."""
-        while self._place is None:
+        while self._address is None:
             self._found.clear()
             await self._found.wait()
-        return self._place
+        return self._address
 
     def answered(self, url: str) -> None:
         """The master at `url` answers."""
-        if self._place is not None and self._place.url == url:
+        if self._address is not None and self._address.url == url:
             self._silent_since_ns = None
             self._answered_once = True
             self._lost.clear()
 
     async def keep(self, url: str, cell: str) -> None:
         """The master at `url` has taken us in, and watches `cell`: the one to return to, also after a restart."""
-        if self._place is None or self._place.url != url:
+        if self._address is None or self._address.url != url:
             return
-        kept = Kept(url, cell, self._place.found_by, self._wanted.url)
-        before, self._kept = self._kept, kept
-        if before is None or (before.url, before.cell, before.configured) != (kept.url, kept.cell, kept.configured):
-            await asyncio.to_thread(save_kept, self._path, kept)
+        before, after = self._last_master, LastMaster(url, cell, self._address.found_by, self._criteria.url)
+        self._last_master = after
+        if before is None or (before.url, before.cell, before.configured) != (after.url, after.cell, after.configured):
+            await asyncio.to_thread(save_last_master, self._path, after)
 
     def unanswered(self, now_ns: int) -> None:
         """The master does not answer, or is none for us."""
@@ -135,89 +135,93 @@ class MasterSearch:
                     offers, now_ns = await browser.offers(), self._clock.now_ns()
                     if not offers:
                         none_since_ns = now_ns
-                    hear_s = HEAR_FIRST_S if self._any_cell else HEAR_S
-                    heard = now_ns - (none_since_ns if offers else began_ns) >= hear_s * NS_PER_S
-                    await self._look(offers if heard else None)
+                    collect_s = COLLECT_FIRST_S if self._any_cell else COLLECT_S
+                    collected = now_ns - (none_since_ns if offers else began_ns) >= collect_s * NS_PER_S
+                    await self._search_once(offers if collected else None)
                     if self.lost:
-                        await wait_set(browser.changed, LOOK_S if heard else HEAR_S, self._clock)
+                        await wait_set(browser.changed, SEARCH_INTERVAL_S if collected else COLLECT_S, self._clock)
 
-    async def _look(self, offers: Sequence[Offer] | None) -> None:
-        """Take another place, if there is one that will do; None: it is too early to choose among offers."""
+    async def _search_once(self, offers: Sequence[Offer] | None) -> None:
+        """Take another address, if there is one that will do; None: it is too early to choose among offers."""
         now_ns = self._clock.now_ns()
-        self._vain = {url: at_ns for url, at_ns in self._vain.items() if now_ns - at_ns < VAIN_S * NS_PER_S}
-        before = [first_place(self._wanted, None), first_place(Wanted(), self._kept)]
-        for place in before:
-            if place is not None and self._new(place.url) and not await self._reach(place.url):
-                self._take(place)
+        self._failed_at_ns = {
+            url: at_ns for url, at_ns in self._failed_at_ns.items() if now_ns - at_ns < RETRY_AFTER_S * NS_PER_S
+        }
+        before = [initial_address(self._criteria, None), initial_address(MasterCriteria(), self._last_master)]
+        for address in before:
+            if address is not None and self._is_untried(address.url) and not await self._reach(address.url):
+                self._take(address)
                 return
         if offers is None:
             return
-        tried = [url for offer in offers for url in offer.urls if not self._new(url)]
-        candidates = await judged(offers, self._wanted, self._kept, self._tls, self._source_address, tried)
+        tried = [url for offer in offers for url in offer.urls if not self._is_untried(url)]
+        candidates = await check_offers(
+            offers, self._criteria, self._last_master, self._tls, self._source_address, tried
+        )
         if self._any_cell and len(self._cells) < MAX_OFFERS:
             # Who is not believed counts for nothing; who is merely slow to answer is there nevertheless.
-            ours = [one.offer for one in candidates if one.url is not None] if self._wanted.checked else offers
-            self._cells |= {one.says.cell for one in ours if objection(one, self._wanted, self._kept) is None}
+            ours = [one.offer for one in candidates if one.url is not None] if self._criteria.checked else offers
+            self._cells |= {one.says.cell for one in ours if objection(one, self._criteria, self._last_master) is None}
         chosen, self.outcome = choose(candidates, self._cells)
         if chosen is not None and chosen.url is not None:
-            self._take(Place(chosen.url, self.outcome))
+            self._take(MasterAddress(chosen.url, self.outcome))
             return
         logged, logged_at_ns = self._logged
-        if now_ns - logged_at_ns >= TELL_S * NS_PER_S and self.outcome != logged:
+        if now_ns - logged_at_ns >= LOG_INTERVAL_S * NS_PER_S and self.outcome != logged:
             logger.info("%s", self.outcome)
             self._logged = self.outcome, now_ns
 
     @property
     def _any_cell(self) -> bool:
         """Whether nothing says which cell's master is ours."""
-        return self._kept is None and self._wanted.cell is None
+        return self._last_master is None and self._criteria.cell is None
 
     async def _reach(self, url: str) -> str | None:
         return await reach(url, self._tls, self._source_address)
 
-    def _new(self, url: str) -> bool:
+    def _is_untried(self, url: str) -> bool:
         """Whether it is worth a try: neither where we are, nor where we were in vain a moment ago."""
-        return url not in self._vain and (self._place is None or url != self._place.url)
+        return url not in self._failed_at_ns and (self._address is None or url != self._address.url)
 
-    def _take(self, place: Place) -> None:
-        if self._place is not None and not self._answered_once:
-            self._vain[self._place.url] = self._clock.now_ns()
-        self._place = place
+    def _take(self, address: MasterAddress) -> None:
+        if self._address is not None and not self._answered_once:
+            self._failed_at_ns[self._address.url] = self._clock.now_ns()
+        self._address = address
         self._silent_since_ns = None
         self._answered_once = False
         self._lost.clear()
         self._found.set()
 
 
-def wanted_of(config: UnitConfig) -> Wanted:
+def criteria_of(config: UnitConfig) -> MasterCriteria:
     """What a configuration says of the master."""
     url = None if config.master_url is None else config.master_url.rstrip("/")
-    return Wanted(url, config.cell, config.checks_master, config.master_fingerprint)
+    return MasterCriteria(url, config.cell, config.checks_master, config.master_fingerprint)
 
 
-def kept_of(config: UnitConfig) -> Kept | None:
+def last_master_of(config: UnitConfig) -> LastMaster | None:
     """The master that took this unit in last, if the configuration still lets it go there."""
-    kept = load_kept(config.state_dir / FILE_NAME)
-    return None if kept is None or distrusted(kept, wanted_of(config)) else kept
+    last_master = load_last_master(config.state_dir / FILE_NAME)
+    return None if last_master is None or is_ruled_out(last_master, criteria_of(config)) else last_master
 
 
-async def judged(
+async def check_offers(
     offers: Sequence[Offer],
-    wanted: Wanted,
-    kept: Kept | None,
+    criteria: MasterCriteria,
+    last_master: LastMaster | None,
     tls: ssl.SSLContext,
     source_address: str | None,
-    passed_over: Sequence[str] = (),
+    skipped: Sequence[str] = (),
 ) -> list[Candidate]:
-    """Each offer with what speaks against it, or where it was reached; URLs in `passed_over` are not tried."""
+    """Each offer with what speaks against it, or where it was reached; URLs in `skipped` are not tried."""
     own = own_addresses()
 
     async def candidate(offer: Offer) -> Candidate:
-        against = objection(offer, wanted, kept)
+        against = objection(offer, criteria, last_master)
         if against is not None:
             return Candidate(offer, None, against)
         against = "it was tried in vain"
-        for url in in_order([url for url in offer.urls if url not in passed_over], own):
+        for url in in_order([url for url in offer.urls if url not in skipped], own):
             failure = await reach(url, tls, source_address)
             if failure is None:
                 return Candidate(offer, url)
@@ -239,30 +243,32 @@ async def reach(url: str, tls: ssl.SSLContext, source_address: str | None) -> st
         writer.transport.abort()
 
     try:
-        return None if await within(REACH_S, connect()) else f"it does not answer within {REACH_S:g} s"
+        return (
+            None if await within(CONNECT_TIMEOUT_S, connect()) else f"it does not answer within {CONNECT_TIMEOUT_S:g} s"
+        )
     except OSError as error:
         return f"it cannot be reached: {str(error) or type(error).__name__}"
 
 
-def load_kept(path: Path) -> Kept | None:
+def load_last_master(path: Path) -> LastMaster | None:
     """The master that answered last, or None; a damaged file is as good as none."""
-    return StateFile(path).load(_kept_of_document)
+    return StateFile(path).load(_last_master_of_document)
 
 
-def save_kept(path: Path, kept: Kept) -> None:
+def save_last_master(path: Path, last_master: LastMaster) -> None:
     """Remember a master; where nothing can be written nothing is remembered, and a warning says so."""
-    StateFile(path).save(dataclasses.asdict(kept))
+    StateFile(path).save(dataclasses.asdict(last_master))
 
 
-def _kept_of_document(document: Any) -> Kept:
+def _last_master_of_document(document: Any) -> LastMaster:
     configured = document["configured"]
-    kept = Kept(
+    last_master = LastMaster(
         str(document["url"]),
         str(document["cell"]),
         str(document["found_by"]),
         None if configured is None else str(configured),
     )
-    parts = urlsplit(kept.url)
+    parts = urlsplit(last_master.url)
     if parts.scheme not in ("http", "https") or not parts.hostname or parts.port is None:
-        raise ValueError(f"expected http://host:port, got {kept.url[:80]!r}")
-    return kept
+        raise ValueError(f"expected http://host:port, got {last_master.url[:80]!r}")
+    return last_master

@@ -2,7 +2,7 @@
 """Which of the masters that were heard of is ours, decided from what is configured, kept and heard; no network here.
 
     configured   master_url, first in any case
-    kept         the last master that answered
+    last_master         the last master that answered
     announced    ... if it watches our cell and may be believed as much as the one before, and is the only such
 
 A foreign cell's master is taken only by a unit that was never told and never had another.
@@ -20,7 +20,7 @@ from shared.messages import CONTRACT_MINOR, CONTRACT_VERSION
 
 
 @dataclass(frozen=True)
-class Place:
+class MasterAddress:
     """Where a master is, in the form of a URL, and how that is known."""
 
     url: str
@@ -28,7 +28,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Kept:
+class LastMaster:
     """The last master that took us in: where, which cell it watched, how it was found, and the master_url of then."""
 
     url: str
@@ -38,7 +38,7 @@ class Kept:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class MasterCriteria:
     """What the configuration says of the master. With `checked`, it is known by its certificate."""
 
     url: str | None = None
@@ -61,42 +61,43 @@ class Candidate:
         return f"{self.offer.name!r} (cell {cell}, {where}){why}"
 
 
-def first_place(wanted: Wanted, kept: Kept | None) -> Place | None:
+def initial_address(criteria: MasterCriteria, last_master: LastMaster | None) -> MasterAddress | None:
     """Where to go before anything is heard; None when nobody knows."""
-    if wanted.url is not None:
-        return Place(wanted.url, "configured")
-    return None if kept is None or distrusted(kept, wanted) else Place(kept.url, "as before")
+    if criteria.url is not None:
+        return MasterAddress(criteria.url, "configured")
+    if last_master is None or is_ruled_out(last_master, criteria):
+        return None
+    return MasterAddress(last_master.url, "as before")
 
 
-def distrusted(kept: Kept, wanted: Wanted) -> bool:
+def is_ruled_out(last_master: LastMaster, criteria: MasterCriteria) -> bool:
     """Whether the configuration has changed so that the master of before will not do."""
-    if wanted.checked and not kept.url.startswith("https://"):
+    if criteria.checked and not last_master.url.startswith("https://"):
         return True
-    if wanted.url is not None and wanted.url != kept.configured:
+    if criteria.url is not None and criteria.url != last_master.configured:
         return True
-    return wanted.cell is not None and kept.cell != wanted.cell
+    return criteria.cell is not None and last_master.cell != criteria.cell
 
 
-def objection(offer: Offer, wanted: Wanted, kept: Kept | None) -> str | None:
+def objection(offer: Offer, criteria: MasterCriteria, last_master: LastMaster | None) -> str | None:
     """Why this master is not for us, or None; what it says of itself is only ever held against it."""
     says = offer.says
     if says.contract != CONTRACT_VERSION or says.minor < CONTRACT_MINOR:
         older = "this unit" if says.contract > CONTRACT_VERSION else "the master"
         theirs, ours = f"{says.contract}.{says.minor}", f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
         return f"it speaks contract {theirs}, this unit {ours}; update {older} first"
-    if wanted.checked and not says.tls:
+    if criteria.checked and not says.tls:
         return "it does not speak TLS, and its certificate is to be checked"
-    if wanted.fingerprint is not None and says.fingerprint != wanted.fingerprint[:SHA_DIGITS]:
+    if criteria.fingerprint is not None and says.fingerprint != criteria.fingerprint[:SHA_DIGITS]:
         return "its certificate is not that of master_fingerprint"
-    if kept is not None and kept.url.startswith("https://") and not says.tls:
+    if last_master is not None and last_master.url.startswith("https://") and not says.tls:
         return "it does not speak TLS, as the master before did"
-    if wanted.cell is not None:
-        return None if says.cell == shortened(wanted.cell) else f"it does not watch cell {wanted.cell}"
-    if kept is not None:
-        return (
-            None if says.cell == shortened(kept.cell) else f"it does not watch cell {kept.cell}, as the master before"
-        )
-    return "master_url names another" if wanted.url is not None else None
+    if criteria.cell is not None:
+        return None if says.cell == shortened(criteria.cell) else f"it does not watch cell {criteria.cell}"
+    if last_master is not None:
+        same = says.cell == shortened(last_master.cell)
+        return None if same else f"it does not watch cell {last_master.cell}, as the master before"
+    return "master_url names another" if criteria.url is not None else None
 
 
 def choose(candidates: Sequence[Candidate], cells: Collection[str] = ()) -> tuple[Candidate | None, str]:

@@ -7,7 +7,7 @@ never delay. Whatever goes wrong, it registers again; the master may have been r
 How far it has come is its phase; each has its own way of trying again, and each change is one line in the journal:
 
     searching ───► registering ───► fetching ───► localising ───► live
-     for a place    at that place    the cell      the camera,     every frame
+     for a address    at that address    the cell      the camera,     every frame
      every 2 s,     every 50 to      that is not   by the board,   is filtered
      and when       250 ms           on disk       for ever        and reported
      one is heard       ▲            already           ▲              │
@@ -92,7 +92,7 @@ START_OVER = frozenset({401, 403, 404, 409})
 
 
 @dataclass(frozen=True)
-class _Unclear:
+class _NotUnderstood:
     """A session of which this unit does not understand all that it would have to obey."""
 
     session: int
@@ -103,7 +103,7 @@ class _Unclear:
 
 
 @dataclass
-class _Told:
+class _Logged:
     """What the journal was told last, so that it is not told again with each attempt."""
 
     complaint: str = ""
@@ -125,7 +125,7 @@ class CameraState:
         return facts if self.warning is None else facts | {"warning": self.warning}
 
 
-class _Presented(NamedTuple):
+class _CameraToRegister(NamedTuple):
     """The camera to register with, and the pose that the master is told: `T_world_camera` and where it is from."""
 
     camera: CameraInfo
@@ -155,13 +155,13 @@ class Uplink:
         self.search = search
         self._cells = cells
         self._program = software, boot_id
-        self._presented: _Presented | None = None
+        self._camera: _CameraToRegister | None = None
         self._outbox = Outbox(on_sent, clock)
         self._ledger = CommandLedger()
         self._session = Session()
         self._latest = LatestAssignment()
-        self._unclear: _Unclear | None = None
-        self._told = _Told()
+        self._not_understood: _NotUnderstood | None = None
+        self._logged = _Logged()
         self.phase: Phase | None = None
         self.joints = JointHistory()
         self.camera_state = CameraState()
@@ -174,7 +174,7 @@ class Uplink:
     @property
     def assigned(self) -> asyncio.Event:
         """Set while there is an assignment."""
-        return self._latest.there
+        return self._latest.available
 
     @property
     def commands(self) -> asyncio.Queue[Command]:
@@ -193,10 +193,10 @@ class Uplink:
 
         `known_pose` (`T_world_camera` and where it is from) is told to the master, which may know better.
         """
-        before = None if self._presented is None else self._presented.camera
+        before = None if self._camera is None else self._camera.camera
         if before is not None and (before.serial, before.intrinsics) != (camera.serial, camera.intrinsics):
             self._start_over()
-        self._presented = _Presented(camera, known_pose)
+        self._camera = _CameraToRegister(camera, known_pose)
         self._outbox.wake()
 
     def offer(self, report: Report) -> None:
@@ -207,12 +207,12 @@ class Uplink:
         """Tell the master with the next update what became of a command; from any thread."""
         self._ledger.finish(command, outcome)
 
-    async def send_picture(self, command: Command, png: bytes) -> None:
+    async def send_image(self, command: Command, png: bytes) -> None:
         """Send the picture that a command asks for. Raises as `MasterClient.update`."""
         assert command.image is not None
         await self._client.put_image(self._session.id, command.image, command.id, png)
 
-    async def tell_pose(self, T_world_camera: Transform, origin: str, quality: PoseQuality) -> None:
+    async def report_pose(self, T_world_camera: Transform, origin: str, quality: PoseQuality) -> None:
         """This unit's camera was found to be there; the next frame is processed with it.
 
         Raises:
@@ -226,14 +226,14 @@ class Uplink:
             self._assign(replace(self.assignment, versions=versions, T_world_camera=T_world_camera))
 
     @property
-    def standing(self) -> str:
+    def status_text(self) -> str:
         """How it stands with the master, in words for a person."""
         if self.search is not None and not self._client.url:
             return f"no master: {self.search.outcome}"
-        if self._told.complaint:
-            return f"no master: {self._told.complaint}"
-        if self._unclear is not None:
-            return self._unclear.trouble.sentence
+        if self._logged.complaint:
+            return f"no master: {self._logged.complaint}"
+        if self._not_understood is not None:
+            return self._not_understood.trouble.sentence
         if self.assignment is None:
             return f"not registered yet at {self._client.url}"
         return f"unit {self._session.id} at {self._client.url}"
@@ -260,46 +260,46 @@ class Uplink:
         retry_s = RETRY_MIN_S
         while True:
             try:
-                await self._turn_to_master()
+                await self._set_master()
                 assignment = self.assignment
-                if self._unclear is not None:
-                    await self._tell_unclear(self._unclear)
+                if self._not_understood is not None:
+                    await self._report_not_understood(self._not_understood)
                 elif assignment is None:
                     await self._register()
                 else:
                     await self._report(assignment)
-                retry_s, self._told.complaint = RETRY_MIN_S, ""
+                retry_s, self._logged.complaint = RETRY_MIN_S, ""
                 if self.search is not None:
                     self.search.answered(self._client.url)
                 if self.phase == "searching" and self.assignment is not None:
                     self._enter(self.assignment.phase, f"{self._client.url} answers again")
             except MasterRefused as error:
-                registered = self.assignment is not None or self._unclear is not None
+                registered = self.assignment is not None or self._not_understood is not None
                 if error.status in START_OVER and registered:
                     self._start_over()
-                self._miss(error, error.status in NOT_OURS and self.assignment is None)
+                self._note_failure(error, error.status in NOT_OURS and self.assignment is None)
                 retry_s = await self._wait(retry_s, error)
             except CellwatchError as error:
-                foreign = isinstance(error, WireError) and self.assignment is None and self._unclear is None
+                foreign = isinstance(error, WireError) and self.assignment is None and self._not_understood is None
                 if isinstance(error, (WireError, CellError)) and self._session.master_minor > CONTRACT_MINOR:
                     # What registering anew cannot clear up is told as trouble then.
                     self._start_over()
-                self._miss(error, foreign or isinstance(error, MasterUnreachable))
+                self._note_failure(error, foreign or isinstance(error, MasterUnreachable))
                 retry_s = await self._wait(retry_s, error)
 
-    async def _turn_to_master(self) -> None:
+    async def _set_master(self) -> None:
         """To another one, if another was found; while none is known at all, wait."""
         if self.search is None:
             return
         if not self._client.url:
             self._enter("searching", self.search.outcome)
-        place = await self.search.place()
-        if place.url != self._client.url:
-            self._client.aim(place.url)
-            self._told.found_by = place.found_by
+        address = await self.search.address()
+        if address.url != self._client.url:
+            self._client.set_url(address.url)
+            self._logged.found_by = address.found_by
             self._start_over()
 
-    def _miss(self, error: CellwatchError, lost: bool) -> None:
+    def _note_failure(self, error: CellwatchError, lost: bool) -> None:
         """What went wrong may mean that the master is elsewhere."""
         if self.search is not None and lost:
             self.search.unanswered(self._time.now_ns())
@@ -316,11 +316,11 @@ class Uplink:
     async def _register(self) -> None:
         if self.search is None or not self.search.lost:
             self._enter(
-                "registering", f"at {self._client.url}{f', {self._told.found_by}' if self._told.found_by else ''}"
+                "registering", f"at {self._client.url}{f', {self._logged.found_by}' if self._logged.found_by else ''}"
             )
-        while self._presented is None:
+        while self._camera is None:
             await self._outbox.woken(heartbeat=False)
-        camera, known_pose = self._presented
+        camera, known_pose = self._camera
         await self._client.authorize()
         told, origin = known_pose or (None, "configured")
         software, boot_id = self._program
@@ -369,42 +369,42 @@ class Uplink:
         theirs, ours = f"{CONTRACT_VERSION}.{slot.contract_minor}", f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
         trouble = Trouble("contract", f"update this unit: it speaks contract {ours}, its master {theirs}: {error}")
         # As long as the trouble is the same one, registering again did not help.
-        known = trouble.sentence == self._told.refused
-        retry_s = min(2.0 * self._told.contract_retry_s, CONTRACT_RETRY_MAX_S) if known else CONTRACT_RETRY_MIN_S
-        self._told.contract_retry_s = retry_s
+        known = trouble.sentence == self._logged.refused
+        retry_s = min(2.0 * self._logged.contract_retry_s, CONTRACT_RETRY_MAX_S) if known else CONTRACT_RETRY_MIN_S
+        self._logged.contract_retry_s = retry_s
         retry_at_ns = self._time.now_ns() + round(retry_s * NS_PER_S)
-        self._unclear = _Unclear(slot.session, slot.versions, trouble, retry_at_ns)
+        self._not_understood = _NotUnderstood(slot.session, slot.versions, trouble, retry_at_ns)
         level = logging.DEBUG if known else logging.WARNING
         logger.log(level, "%s", trouble.sentence)
-        self._told.refused = trouble.sentence
+        self._logged.refused = trouble.sentence
 
-    async def _tell_unclear(self, unclear: _Unclear) -> None:
+    async def _report_not_understood(self, not_understood: _NotUnderstood) -> None:
         """Tell why nothing is reported; register again when the master says something else, or now and then."""
         self._outbox.drop()
         # The first one goes at once: until it arrives, the master knows only that this unit registered.
-        if unclear.reported:
+        if not_understood.reported:
             await self._outbox.woken()
             self._outbox.drop()
         sent_at_ns = self._time.now_ns()
-        if sent_at_ns > unclear.retry_at_ns:
+        if sent_at_ns > not_understood.retry_at_ns:
             self._start_over()
             return
         answer = await self._client.update(
             UpdateRequest(
                 id=self._session.id,
-                session=unclear.session,
+                session=not_understood.session,
                 sequence=self._session.next_sequence(),
                 sent_at_ns=sent_at_ns,
                 exchange=self._session.exchange,
                 # Not that it works with these, but that it knows of them: so it is not told of them again.
-                versions=unclear.versions,
-                health=Health().model_copy(update=unclear.trouble.facts()),
+                versions=not_understood.versions,
+                health=Health().model_copy(update=not_understood.trouble.facts()),
                 phase="fetching",
             )
         )
         self._session.note(sent_at_ns, answer, self._time.now_ns())
-        self._unclear = replace(unclear, reported=True)
-        if answer.versions != unclear.versions:
+        self._not_understood = replace(not_understood, reported=True)
+        if answer.versions != not_understood.versions:
             self._start_over()
 
     async def _get_cell(self, reference: CellReference) -> Cell:
@@ -434,7 +434,7 @@ class Uplink:
             self._outbox.settle()
         if fresh is not None:
             self._outbox.sent(fresh, delivery)
-        await self._follow(assignment, answer)
+        await self._apply_answer(assignment, answer)
 
     async def _exchange_update(self, assignment: Assignment, report: Report) -> tuple[UpdateAnswer, Delivery]:
         session, versions = self._session, report.assignment.versions
@@ -472,7 +472,7 @@ class Uplink:
         offset_ns = session.clock.offset_ns
         return answer, Delivery(sent_at_ns, answer.received_at_ns - offset_ns, answer.answered_at_ns - offset_ns)
 
-    async def _follow(self, assignment: Assignment, answer: UpdateAnswer) -> None:
+    async def _apply_answer(self, assignment: Assignment, answer: UpdateAnswer) -> None:
         """Do what the master's answer asks for."""
         self._ledger.accept(answer.commands)
         if answer.versions == assignment.versions:
@@ -498,13 +498,13 @@ class Uplink:
 
     def _start_over(self) -> None:
         self._latest.clear()
-        self._unclear = None
+        self._not_understood = None
 
     async def _wait(self, retry_s: float, error: CellwatchError) -> float:
         """Wait before the next attempt; returns how long to wait after that."""
         # Once each: a master that is gone, and then one with another certificate.
-        new = retry_s == RETRY_MIN_S or str(error) != self._told.complaint
-        self._told.complaint = str(error)
+        new = retry_s == RETRY_MIN_S or str(error) != self._logged.complaint
+        self._logged.complaint = str(error)
         level = logging.WARNING if new or isinstance(error, ConfigError) else logging.DEBUG
         logger.log(level, "%s", error)
         await sleep(retry_s * random.uniform(0.8, 1.2), self._time)

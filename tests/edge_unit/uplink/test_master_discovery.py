@@ -16,18 +16,18 @@ from edge_unit.config import UnitConfig
 from edge_unit.sources.simulated import SimulatedSourceConfig
 from edge_unit.uplink import master_discovery as module
 from edge_unit.uplink.master_discovery import (
+    COLLECT_FIRST_S,
+    COLLECT_S,
     FILE_NAME,
-    HEAR_FIRST_S,
-    HEAR_S,
-    LOOK_S,
+    LOG_INTERVAL_S,
     LOST_S,
-    TELL_S,
-    VAIN_S,
+    RETRY_AFTER_S,
+    SEARCH_INTERVAL_S,
     MasterSearch,
-    load_kept,
-    save_kept,
+    load_last_master,
+    save_last_master,
 )
-from edge_unit.uplink.master_selection import Kept, Place
+from edge_unit.uplink.master_selection import LastMaster, MasterAddress
 from shared.discovery import Announcement, Offer
 from shared.messages import CONTRACT_VERSION
 from shared.waiting import within
@@ -42,7 +42,7 @@ PATIENCE_S = 20.0
 class FakeBrowser:
     """Hears what a test says."""
 
-    heard: tuple[Offer, ...] = ()
+    announced: tuple[Offer, ...] = ()
     closed: asyncio.Event
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class FakeBrowser:
         self.closed.set()
 
     async def offers(self) -> tuple[Offer, ...]:
-        return self.heard
+        return self.announced
 
 
 @pytest.fixture
@@ -68,8 +68,8 @@ def made_up(monkeypatch: pytest.MonkeyPatch, clock: SetClock) -> None:
     monkeypatch.setattr(FakeBrowser, "closed", clock.added, raising=False)
     monkeypatch.setattr(module, "Browser", FakeBrowser)
     # A busy machine may be slow to connect to itself; nobody here listens without answering.
-    monkeypatch.setattr(module, "REACH_S", PATIENCE_S)
-    monkeypatch.setattr(FakeBrowser, "heard", ())
+    monkeypatch.setattr(module, "CONNECT_TIMEOUT_S", PATIENCE_S)
+    monkeypatch.setattr(FakeBrowser, "announced", ())
 
 
 def config(folder: Path, **fields: Any) -> UnitConfig:
@@ -100,7 +100,7 @@ def offer(port: int, cell: str = "demo") -> Offer:
 
 
 async def pass_time(search: MasterSearch, clock: SetClock, seconds: float) -> None:
-    """Let so much time pass, look by look; the time at which a place is taken is the end of it."""
+    """Let so much time pass, look by look; the time at which an address is taken is the end of it."""
     end_ns = clock.now + round(seconds * S)
 
     async def rests() -> None:
@@ -136,19 +136,19 @@ async def test_an_announced_master_is_taken_by_a_unit_that_knows_none(
         await pass_time(search, clock, 60.0)
         assert search.lost
         heard_ns = clock.now
-        monkeypatch.setattr(FakeBrowser, "heard", (offer(port),))
+        monkeypatch.setattr(FakeBrowser, "announced", (offer(port),))
         await pass_time(search, clock, 60.0)
         assert not search.lost
-        # From the look at which nobody was heard yet; all who are there have answered since.
-        assert HEAR_FIRST_S <= (clock.now - heard_ns) / S <= HEAR_FIRST_S + LOOK_S
-        place = await search.place()
-        assert place == Place(f"http://127.0.0.1:{port}", f"announced as 'demo at {port}'")
-        await search.keep(place.url, "demo")
-    kept = await asyncio.to_thread(load_kept, tmp_path / FILE_NAME)
-    assert kept == Kept(place.url, "demo", place.found_by)
+        # From the look at which nobody was announced yet; all who are there have answered since.
+        assert COLLECT_FIRST_S <= (clock.now - heard_ns) / S <= COLLECT_FIRST_S + SEARCH_INTERVAL_S
+        address = await search.address()
+        assert address == MasterAddress(f"http://127.0.0.1:{port}", f"announced as 'demo at {port}'")
+        await search.keep(address.url, "demo")
+    last_master = await asyncio.to_thread(load_last_master, tmp_path / FILE_NAME)
+    assert last_master == LastMaster(address.url, "demo", address.found_by)
     # After a restart it goes there at once.
     search = await asyncio.to_thread(MasterSearch, config(tmp_path))
-    assert await search.place() == Place(place.url, "as before")
+    assert await search.address() == MasterAddress(address.url, "as before")
 
 
 async def test_the_same_cells_master_elsewhere_takes_the_place_of_one_that_is_silent(
@@ -158,45 +158,45 @@ async def test_the_same_cells_master_elsewhere_takes_the_place_of_one_that_is_si
     async with listening() as port, running(config(tmp_path, master_url=old), clock) as search:
         await search.keep(old, "demo")
         search.answered(old)
-        monkeypatch.setattr(FakeBrowser, "heard", (offer(port, "other"), offer(port)))
+        monkeypatch.setattr(FakeBrowser, "announced", (offer(port, "other"), offer(port)))
         lose(search, clock)
         await pass_time(search, clock, 60.0)
-        assert (await search.place()).found_by == f"announced as 'demo at {port}'"
-        assert clock.now == START_NS + LOST_NS + round(HEAR_S * S)
+        assert (await search.address()).found_by == f"announced as 'demo at {port}'"
+        assert clock.now == START_NS + LOST_NS + round(COLLECT_S * S)
 
 
 async def test_what_was_tried_in_vain_is_not_tried_again_at_once(
     tmp_path: Path, clock: SetClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with listening() as first, listening() as second, running(config(tmp_path), clock) as search:
-        monkeypatch.setattr(FakeBrowser, "heard", (offer(first),))
+        monkeypatch.setattr(FakeBrowser, "announced", (offer(first),))
         await pass_time(search, clock, 60.0)
-        vain = await search.place()
-        monkeypatch.setattr(FakeBrowser, "heard", (offer(first), offer(second)))
+        vain = await search.address()
+        monkeypatch.setattr(FakeBrowser, "announced", (offer(first), offer(second)))
         lose(search, clock)
         await pass_time(search, clock, 60.0)
-        taken, taken_ns = await search.place(), clock.now
+        taken, taken_ns = await search.address(), clock.now
         assert taken.url == f"http://127.0.0.1:{second}"
         # The other one, which never answered, waits for its time, and so it stays.
         lose(search, clock)
-        again_ns = taken_ns + round(VAIN_S * S)
+        again_ns = taken_ns + round(RETRY_AFTER_S * S)
         await pass_time(search, clock, (again_ns - 1 - clock.now) / S)
-        assert await search.place() == taken
+        assert await search.address() == taken
         assert search.lost
         await pass_time(search, clock, 60.0)
-        assert await search.place() == vain
-        assert again_ns <= clock.now <= again_ns + round(LOOK_S * S)
+        assert await search.address() == vain
+        assert again_ns <= clock.now <= again_ns + round(SEARCH_INTERVAL_S * S)
 
 
 async def test_a_change_of_configuration_is_not_undone_by_what_was_kept(tmp_path: Path, clock: SetClock) -> None:
     async with listening() as port:
-        kept = Kept(f"http://127.0.0.1:{port}", "demo", "configured", "http://127.0.0.1:7")
-        await asyncio.to_thread(save_kept, tmp_path / FILE_NAME, kept)
+        last_master = LastMaster(f"http://127.0.0.1:{port}", "demo", "configured", "http://127.0.0.1:7")
+        await asyncio.to_thread(save_last_master, tmp_path / FILE_NAME, last_master)
         async with running(config(tmp_path, master_url="http://127.0.0.1:9"), clock) as search:
             lose(search, clock)
             await pass_time(search, clock, 60.0)
             assert search.lost
-            assert (await search.place()).url == "http://127.0.0.1:9"
+            assert (await search.address()).url == "http://127.0.0.1:9"
 
 
 async def test_the_journal_is_not_filled_by_strangers(
@@ -205,13 +205,13 @@ async def test_the_journal_is_not_filled_by_strangers(
     caplog.set_level(logging.INFO)
     looks = 20
     async with running(config(tmp_path, cell="demo"), clock) as search:
-        monkeypatch.setattr(FakeBrowser, "heard", (offer(1, "stranger"),))
-        await pass_time(search, clock, HEAR_S)
+        monkeypatch.setattr(FakeBrowser, "announced", (offer(1, "stranger"),))
+        await pass_time(search, clock, COLLECT_S)
         for number in range(looks):
-            monkeypatch.setattr(FakeBrowser, "heard", (offer(1, f"cell{number}"),))
-            await pass_time(search, clock, LOOK_S)
+            monkeypatch.setattr(FakeBrowser, "announced", (offer(1, f"cell{number}"),))
+            await pass_time(search, clock, SEARCH_INTERVAL_S)
     lines = [record for record in caplog.records if record.name == module.__name__]
-    assert len(lines) == 1 + looks * LOOK_S // TELL_S
+    assert len(lines) == 1 + looks * SEARCH_INTERVAL_S // LOG_INTERVAL_S
 
 
 @pytest.mark.parametrize(
@@ -227,13 +227,13 @@ async def test_the_journal_is_not_filled_by_strangers(
 )
 def test_a_damaged_file_is_as_good_as_none(tmp_path: Path, text: str) -> None:
     (tmp_path / FILE_NAME).write_text(text)
-    assert load_kept(tmp_path / FILE_NAME) is None
-    assert load_kept(tmp_path / "gone.json") is None
+    assert load_last_master(tmp_path / FILE_NAME) is None
+    assert load_last_master(tmp_path / "gone.json") is None
 
 
 def test_a_folder_that_cannot_be_written_costs_the_memory_only(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").write_text("")
-    save_kept(tmp_path / "file" / FILE_NAME, Kept("http://a:1", "demo", "configured"))
+    save_last_master(tmp_path / "file" / FILE_NAME, LastMaster("http://a:1", "demo", "configured"))
     assert "cannot be written" in caplog.text

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The master's commands: those that wait, those that are being carried out, and what became of the others.
+"""The master's commands: waiting, being executed, and finished with an outcome.
 
-`finish` is the one door by which the thread that works on frames tells the event loop anything; all else here belongs
-to the loop.
+Only `finish` may be called from the thread that processes frames. All other methods belong to the event loop.
 """
 
 from __future__ import annotations
@@ -15,10 +14,10 @@ from shared.messages import DONE, MAX_COMMANDS, Command, Ended, Outcome
 
 
 class CommandLedger:
-    """One session's commands.
+    """The commands of one session.
 
     Attributes:
-        waiting: those that nobody has taken yet.
+        waiting: the commands that are not taken yet.
     """
 
     def __init__(self) -> None:
@@ -28,18 +27,18 @@ class CommandLedger:
         self._ended: list[Ended] = []
 
     def accept(self, commands: Iterable[Command]) -> None:
-        """Have new commands wait; the master sends again what finds no room."""
+        """Queue the new ones of `commands`. The master sends a command again if the queue was full."""
         for command in commands:
             if command.id not in self._open and not self.waiting.full():
                 self._open[command.id] = command
                 self.waiting.put_nowait(command)
 
     def finish(self, command: Command, outcome: Outcome = DONE) -> None:
-        """Tell the master with the next update what became of a command; from any thread."""
+        """Report the outcome of `command` with the next update. May be called from any thread."""
         self._finished.put(Ended.of(command.id, outcome))
 
     def ended(self) -> tuple[Ended, ...]:
-        """Return what the master is to be told now, at most MAX_COMMANDS."""
+        """Return the outcomes that the next update reports, at most `MAX_COMMANDS`."""
         while True:
             try:
                 ended = self._finished.get_nowait()
@@ -48,14 +47,14 @@ class CommandLedger:
             if ended.id in self._open:
                 self._ended.append(ended)
 
-    def forget(self, told: Iterable[Ended]) -> None:
-        """Forget what the master has heard."""
-        for ended in told:
+    def forget(self, reported: Iterable[Ended]) -> None:
+        """Forget the outcomes that the master has received."""
+        for ended in reported:
             self._ended.remove(ended)
             self._open.pop(ended.id, None)
 
     def clear(self) -> None:
-        """Forget the session's commands; the master sends again what it still wants."""
+        """Forget the commands of the session. The master sends unfinished commands again."""
         self._open.clear()
         self.ended()
         self._ended.clear()

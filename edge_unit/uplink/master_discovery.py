@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looks for the master while it is not known or does not answer, and is silent while it does.
+"""The search for the master. It runs while the master is not known or does not answer, and sends nothing otherwise.
 
-An address is only taken when somebody listens there who passes for the master: with `master_ca` or `master_fingerprint`
-that is a TLS handshake with the right certificate, and whoever fails it hears no more of us, not even a request.
+The unit uses an address only after a connection to it succeeded. With `master_ca` or `master_fingerprint` this includes
+a TLS handshake with the right certificate. A host that fails the handshake gets no request at all.
 """
 
 from __future__ import annotations
@@ -37,34 +37,39 @@ from shared.waiting import LOOP_CLOCK, Clock, wait_set, within
 logger = logging.getLogger(__name__)
 
 LOST_S = 2.0
-"""A master that is restarted is back sooner; then others are looked for."""
+"""Time without an answer after which the search starts. A restarted master is back sooner."""
 
 SEARCH_INTERVAL_S = 2.0
-"""Between looks, unless somebody new is heard of."""
+"""Interval of the search, unless a new master is announced."""
 
 COLLECT_S = 1.0
-"""From the first master that is heard of to the choice: others answer within a fifth of a second."""
+"""Time from the first announcement to the choice. Other masters answer within a fifth of a second."""
 
 COLLECT_FIRST_S = 2.0
-"""... where it is a choice among all cells, and for good: all are asked again after one second, and then after five."""
+"""The same for a choice among the masters of all cells, which is permanent. The browser queries all masters again after
+one second, and then after five."""
 
 CONNECT_TIMEOUT_S = 1.0
-"""For a connection; a master on our own network takes a hundredth of it, a board that is busy ten times that."""
+"""Timeout of a connection attempt. A master on the local network takes a hundredth of it, a busy board a tenth."""
 
 RETRY_AFTER_S = 30.0
-"""Where a master was tried in vain it is not tried again so soon."""
+"""Pause before an address that failed is tried again."""
 
 LOG_INTERVAL_S = 10.0
-"""Between lines in the journal about what is found; anyone on the network could have us write them."""
+"""Minimum time between log lines about announced masters, because any host on the network can cause such lines."""
 
 FILE_NAME = "master.json"
 
 
 class MasterSearch:
-    """Where the master is. Whoever talks to it says whether it answers; `run` looks for another when it does not."""
+    """The master's address.
+
+    The uplink reports with `answered` and `unanswered` if the master answers. If it does not, `run` searches for
+    another address.
+    """
 
     def __init__(self, config: UnitConfig, clock: Clock = LOOP_CLOCK) -> None:
-        """Read files, so make it before the event loop runs.
+        """Read files. Call it outside the event loop.
 
         Raises:
             ConfigError: `master_ca` cannot be read or holds no certificate.
@@ -82,34 +87,34 @@ class MasterSearch:
         self._answered_once = False
         self._failed_at_ns: dict[str, int] = {}
         self._cells: set[str] = set()
-        # The last line in the journal, and its time.
+        # The last log line, and its time.
         self._logged = "", clock.now_ns() - round(LOG_INTERVAL_S * NS_PER_S)
-        self.outcome = "no master is configured, and none was known before"
-        """What was found last, in words."""
+        self.outcome = "no master is configured, and no earlier master is known"
+        """Result of the last search, as a sentence."""
         if self._address is None:
             self._lost.set()
 
     @property
     def lost(self) -> bool:
-        """Whether it looks."""
+        """Return True while the search runs."""
         return self._lost.is_set()
 
     async def address(self) -> MasterAddress:
-        """Where to turn to now; waits while nobody knows."""
+        """Return the address to use now. Wait while none is known."""
         while self._address is None:
             self._found.clear()
             await self._found.wait()
         return self._address
 
     def answered(self, url: str) -> None:
-        """The master at `url` answers."""
+        """Note that the master at `url` answers, which ends the search."""
         if self._address is not None and self._address.url == url:
             self._silent_since_ns = None
             self._answered_once = True
             self._lost.clear()
 
     async def keep(self, url: str, cell: str) -> None:
-        """The master at `url` has taken us in, and watches `cell`: the one to return to, also after a restart."""
+        """Save the master at `url`, which registered the unit and watches `cell`, for reconnects and restarts."""
         if self._address is None or self._address.url != url:
             return
         before, after = self._last_master, LastMaster(url, cell, self._address.found_by, self._criteria.url)
@@ -118,14 +123,14 @@ class MasterSearch:
             await asyncio.to_thread(save_last_master, self._path, after)
 
     def unanswered(self, now_ns: int) -> None:
-        """The master does not answer, or is none for us."""
+        """Note that the master does not answer or refuses this unit. After `LOST_S` the search starts."""
         if self._silent_since_ns is None:
             self._silent_since_ns = now_ns
         elif now_ns - self._silent_since_ns >= LOST_S * NS_PER_S:
             self._lost.set()
 
     async def run(self) -> None:
-        """Look whenever it is lost, until cancelled."""
+        """Search whenever the master is lost, until cancelled."""
         while True:
             await self._lost.wait()
             began_ns = none_since_ns = self._clock.now_ns()
@@ -142,7 +147,7 @@ class MasterSearch:
                         await wait_set(browser.changed, SEARCH_INTERVAL_S if collected else COLLECT_S, self._clock)
 
     async def _search_once(self, offers: Sequence[Offer] | None) -> None:
-        """Take another address, if there is one that will do; None: it is too early to choose among offers."""
+        """Use another address, if one is suitable. `offers` is None while it is too early to choose among them."""
         now_ns = self._clock.now_ns()
         self._failed_at_ns = {
             url: at_ns for url, at_ns in self._failed_at_ns.items() if now_ns - at_ns < RETRY_AFTER_S * NS_PER_S
@@ -159,7 +164,7 @@ class MasterSearch:
             offers, self._criteria, self._last_master, self._tls, self._source_address, tried
         )
         if self._any_cell and len(self._cells) < MAX_OFFERS:
-            # Who is not believed counts for nothing; who is merely slow to answer is there nevertheless.
+            # A master that fails the check of its certificate does not count. A master that answers slowly does.
             ours = [one.offer for one in candidates if one.url is not None] if self._criteria.checked else offers
             self._cells |= {one.says.cell for one in ours if objection(one, self._criteria, self._last_master) is None}
         chosen, self.outcome = choose(candidates, self._cells)
@@ -173,14 +178,14 @@ class MasterSearch:
 
     @property
     def _any_cell(self) -> bool:
-        """Whether nothing says which cell's master is ours."""
+        """Return True if neither the configuration nor the last master determines the cell."""
         return self._last_master is None and self._criteria.cell is None
 
     async def _reach(self, url: str) -> str | None:
         return await reach(url, self._tls, self._source_address)
 
     def _is_untried(self, url: str) -> bool:
-        """Whether it is worth a try: neither where we are, nor where we were in vain a moment ago."""
+        """Return True if `url` is not the address in use, and did not fail within the last `RETRY_AFTER_S`."""
         return url not in self._failed_at_ns and (self._address is None or url != self._address.url)
 
     def _take(self, address: MasterAddress) -> None:
@@ -194,13 +199,13 @@ class MasterSearch:
 
 
 def criteria_of(config: UnitConfig) -> MasterCriteria:
-    """What a configuration says of the master."""
+    """Return the configuration's criteria for the master."""
     url = None if config.master_url is None else config.master_url.rstrip("/")
     return MasterCriteria(url, config.cell, config.checks_master, config.master_fingerprint)
 
 
 def last_master_of(config: UnitConfig) -> LastMaster | None:
-    """The master that took this unit in last, if the configuration still lets it go there."""
+    """Return the master that registered this unit last, or None if the configuration rules it out."""
     last_master = load_last_master(config.state_dir / FILE_NAME)
     return None if last_master is None or is_ruled_out(last_master, criteria_of(config)) else last_master
 
@@ -213,14 +218,14 @@ async def check_offers(
     source_address: str | None,
     skipped: Sequence[str] = (),
 ) -> list[Candidate]:
-    """Each offer with what speaks against it, or where it was reached; URLs in `skipped` are not tried."""
+    """Return each offer with the URL that was reached, or with an objection. URLs in `skipped` are not tried."""
     own = own_addresses()
 
     async def candidate(offer: Offer) -> Candidate:
         against = objection(offer, criteria, last_master)
         if against is not None:
             return Candidate(offer, None, against)
-        against = "it was tried in vain"
+        against = "an earlier attempt failed"
         for url in in_order([url for url in offer.urls if url not in skipped], own):
             failure = await reach(url, tls, source_address)
             if failure is None:
@@ -232,7 +237,7 @@ async def check_offers(
 
 
 async def reach(url: str, tls: ssl.SSLContext, source_address: str | None) -> str | None:
-    """Why nobody is at `url` who passes for a master, or None; nothing is sent but a handshake."""
+    """Try to connect to `url`, and return the reason of a failure or None. Only a TLS handshake is sent."""
     parts = urlsplit(url)
     local = None if source_address is None else (source_address, 0)
 
@@ -251,12 +256,12 @@ async def reach(url: str, tls: ssl.SSLContext, source_address: str | None) -> st
 
 
 def load_last_master(path: Path) -> LastMaster | None:
-    """The master that answered last, or None; a damaged file is as good as none."""
+    """Return the saved master. Return None if the file is missing or damaged."""
     return StateFile(path).load(_last_master_of_document)
 
 
 def save_last_master(path: Path, last_master: LastMaster) -> None:
-    """Remember a master; where nothing can be written nothing is remembered, and a warning says so."""
+    """Save a master. If the file cannot be written, log a warning."""
     StateFile(path).save(dataclasses.asdict(last_master))
 
 

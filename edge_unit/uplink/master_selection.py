@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of the masters that were heard of is ours, decided from what is configured, kept and heard; no network here.
+"""The choice of the unit's master. It uses the configuration, the last master and the announcements, and no network.
 
-    configured   master_url, first in any case
-    last_master         the last master that answered
-    announced    ... if it watches our cell and may be believed as much as the one before, and is the only such
+    configured   `master_url`; always tried first
+    last master  the master that registered this unit last
+    announced    the only announced master that watches the unit's cell and is checked as strictly as the last one
 
-A foreign cell's master is taken only by a unit that was never told and never had another.
+A unit accepts a master of any cell only if no cell is configured and it never had a master before.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from shared.messages import CONTRACT_MINOR, CONTRACT_VERSION
 
 @dataclass(frozen=True)
 class MasterAddress:
-    """Where a master is, in the form of a URL, and how that is known."""
+    """The URL of a master, and the way in which it was found."""
 
     url: str
     found_by: str
@@ -29,7 +29,14 @@ class MasterAddress:
 
 @dataclass(frozen=True)
 class LastMaster:
-    """The last master that took us in: where, which cell it watched, how it was found, and the master_url of then."""
+    """The last master that registered this unit.
+
+    Attributes:
+        url: its URL.
+        cell: the name of its cell.
+        found_by: the way in which it was found.
+        configured: `master_url` at that time.
+    """
 
     url: str
     cell: str
@@ -39,7 +46,7 @@ class LastMaster:
 
 @dataclass(frozen=True)
 class MasterCriteria:
-    """What the configuration says of the master. With `checked`, it is known by its certificate."""
+    """The configuration's criteria for the master. With `checked`, its certificate must be valid."""
 
     url: str | None = None
     cell: str | None = None
@@ -49,7 +56,7 @@ class MasterCriteria:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A master that was heard of; `url` is where it was reached, `objection` why it is not for us."""
+    """An announced master: the `url` at which it was reached, or the `objection` to it."""
 
     offer: Offer
     url: str | None = None
@@ -62,7 +69,7 @@ class Candidate:
 
 
 def initial_address(criteria: MasterCriteria, last_master: LastMaster | None) -> MasterAddress | None:
-    """Where to go before anything is heard; None when nobody knows."""
+    """Return the address to use before any announcement, or None if none is known."""
     if criteria.url is not None:
         return MasterAddress(criteria.url, "configured")
     if last_master is None or is_ruled_out(last_master, criteria):
@@ -71,7 +78,7 @@ def initial_address(criteria: MasterCriteria, last_master: LastMaster | None) ->
 
 
 def is_ruled_out(last_master: LastMaster, criteria: MasterCriteria) -> bool:
-    """Whether the configuration has changed so that the master of before will not do."""
+    """Return True if the configuration has changed and no longer allows the last master."""
     if criteria.checked and not last_master.url.startswith("https://"):
         return True
     if criteria.url is not None and criteria.url != last_master.configured:
@@ -80,31 +87,34 @@ def is_ruled_out(last_master: LastMaster, criteria: MasterCriteria) -> bool:
 
 
 def objection(offer: Offer, criteria: MasterCriteria, last_master: LastMaster | None) -> str | None:
-    """Why this master is not for us, or None; what it says of itself is only ever held against it."""
+    """Return the reason why this master does not fit, or None.
+
+    An announcement is not authenticated. It can only exclude a master, and never proves its identity.
+    """
     says = offer.says
     if says.contract != CONTRACT_VERSION or says.minor < CONTRACT_MINOR:
         older = "this unit" if says.contract > CONTRACT_VERSION else "the master"
         theirs, ours = f"{says.contract}.{says.minor}", f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
         return f"it speaks contract {theirs}, this unit {ours}; update {older} first"
     if criteria.checked and not says.tls:
-        return "it does not speak TLS, and its certificate is to be checked"
+        return "it does not speak TLS, but its certificate must be checked"
     if criteria.fingerprint is not None and says.fingerprint != criteria.fingerprint[:SHA_DIGITS]:
-        return "its certificate is not that of master_fingerprint"
+        return "its certificate does not match master_fingerprint"
     if last_master is not None and last_master.url.startswith("https://") and not says.tls:
-        return "it does not speak TLS, as the master before did"
+        return "it does not speak TLS, but the last master did"
     if criteria.cell is not None:
         return None if says.cell == shortened(criteria.cell) else f"it does not watch cell {criteria.cell}"
     if last_master is not None:
         same = says.cell == shortened(last_master.cell)
-        return None if same else f"it does not watch cell {last_master.cell}, as the master before"
-    return "master_url names another" if criteria.url is not None else None
+        return None if same else f"it does not watch cell {last_master.cell} of the last master"
+    return "master_url names another master" if criteria.url is not None else None
 
 
 def choose(candidates: Sequence[Candidate], cells: Collection[str] = ()) -> tuple[Candidate | None, str]:
-    """The one to take, if it is the only one that was reached and will do; and what was found, in words.
+    """Return the only suitable candidate that was reached, or None; and the result as a sentence.
 
-    `cells` are those whose masters would have done until now: where there were several, the last one that is left is
-    no better than the others were.
+    `cells` are the cells of all suitable masters until now. If there were several, the unit does not choose the last
+    remaining one, because it was not preferable to the others.
     """
     if not candidates:
         return None, "no master is announced on this network"
@@ -120,9 +130,9 @@ def choose(candidates: Sequence[Candidate], cells: Collection[str] = ()) -> tupl
 
 
 def in_order(urls: Sequence[str], own: Sequence[IPv4Interface]) -> list[str]:
-    """A master's URLs, the likeliest first: in one of our own networks, then beyond, then at an address of our own.
+    """Return a master's URLs, likeliest first: local networks, other networks, this machine's addresses.
 
-    The same private address may be many machines' own, so it is this machine only where nothing else answers.
+    Many machines can have the same private address. So an address of this machine is tried last.
     """
 
     def rank(url: str) -> int:

@@ -103,7 +103,7 @@ class Unit:
         self._search = BoardSearch(source, config.board_stream, clock)
         self._processor = self._make_processor()
         self._tasks = TaskGroup()
-        self._images = ImageRequests(self.uplink, self._processor.assigned, self._tasks)
+        self._image_requests = ImageRequests(self.uplink, self._processor.assigned, self._tasks)
         self._stall_detector = StallDetector(clock)
         self._warm_up: asyncio.Task[None] | None = None
         self._limiter = FrameLimiter(config.fps_max)
@@ -242,7 +242,7 @@ class Unit:
         report = troubled(assignment, frame, trouble)
         self._status.note_trouble(report.health.trouble or NO_POSE)
         self.uplink.offer(report)
-        await self._images.show(batch.images, frame, None)
+        await self._image_requests.show(batch.images, frame, None)
         can_localise = self._config.localise and assignment.cell.board is not None
         if can_localise and self._search.due:
             await localise(self._search, self.uplink, assignment, frame)
@@ -264,7 +264,7 @@ class Unit:
             )
         self._status.note_frame(report.health.trouble)
         self.uplink.offer(report)
-        await self._images.show(batch.images, frame, joints)
+        await self._image_requests.show(batch.images, frame, joints)
         for task in self._processor.afterwards(frame, joints, report):
             self._tasks.start(task)
 

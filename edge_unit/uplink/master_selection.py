@@ -120,13 +120,13 @@ def choose(candidates: Sequence[Candidate], cells: Collection[str] = ()) -> tupl
         return None, "no master is announced on this network"
     fit = [candidate for candidate in candidates if candidate.objection is None and candidate.url is not None]
     if len(fit) == 1 and set(cells) - {fit[0].offer.says.cell}:
-        there = ", ".join(sorted({*cells, fit[0].offer.says.cell}))
-        return None, f"masters of several cells were here ({there}), choose one by cell or master_url: {fit[0]}"
+        names = ", ".join(sorted({*cells, fit[0].offer.says.cell}))
+        return None, f"masters of several cells were announced ({names}), choose one by cell or master_url: {fit[0]}"
     if len(fit) == 1:
         return fit[0], f"announced as {fit[0].offer.name!r}"
     if fit:
-        return None, f"{len(fit)} masters would do, choose one by cell or master_url: {'; '.join(map(str, fit))}"
-    return None, f"none of the announced masters will do: {'; '.join(map(str, candidates))}"
+        return None, f"{len(fit)} masters are suitable, choose one by cell or master_url: {'; '.join(map(str, fit))}"
+    return None, f"none of the announced masters is suitable: {'; '.join(map(str, candidates))}"
 
 
 def in_order(urls: Sequence[str], own: Sequence[IPv4Interface]) -> list[str]:

@@ -127,7 +127,7 @@ class CameraState:
         return facts if self.warning is None else facts | {"warning": self.warning}
 
 
-class _CameraToRegister(NamedTuple):
+class _RegisteringCamera(NamedTuple):
     """The camera to register with, and the pose to report to the master: `T_world_camera` and its origin."""
 
     camera: CameraInfo
@@ -157,7 +157,7 @@ class Uplink:
         self.search = search
         self._cells = cells
         self._program = software, boot_id
-        self._camera: _CameraToRegister | None = None
+        self._registering_camera: _RegisteringCamera | None = None
         self._outbox = Outbox(on_sent, clock)
         self._ledger = CommandLedger()
         self._session = Session()
@@ -195,10 +195,10 @@ class Uplink:
 
         `known_pose` (`T_world_camera` and its origin) is reported to the master, which can answer with another pose.
         """
-        before = None if self._camera is None else self._camera.camera
+        before = None if self._registering_camera is None else self._registering_camera.camera
         if before is not None and (before.serial, before.intrinsics) != (camera.serial, camera.intrinsics):
             self._start_over()
-        self._camera = _CameraToRegister(camera, known_pose)
+        self._registering_camera = _RegisteringCamera(camera, known_pose)
         self._outbox.wake()
 
     def offer(self, report: Report) -> None:
@@ -262,7 +262,7 @@ class Uplink:
         retry_s = RETRY_MIN_S
         while True:
             try:
-                await self._set_master()
+                await self._select_master()
                 assignment = self.assignment
                 if self._not_understood is not None:
                     await self._report_not_understood(self._not_understood)
@@ -289,7 +289,7 @@ class Uplink:
                 self._note_failure(error, foreign or isinstance(error, MasterUnreachable))
                 retry_s = await self._wait(retry_s, error)
 
-    async def _set_master(self) -> None:
+    async def _select_master(self) -> None:
         """Set the client to the master that the search found. Wait while no master is known."""
         if self.search is None:
             return
@@ -320,9 +320,9 @@ class Uplink:
             self._enter(
                 "registering", f"at {self._client.url}{f', {self._logged.found_by}' if self._logged.found_by else ''}"
             )
-        while self._camera is None:
+        while self._registering_camera is None:
             await self._outbox.woken(heartbeat=False)
-        camera, known_pose = self._camera
+        camera, known_pose = self._registering_camera
         await self._client.authorize()
         reported, origin = known_pose or (None, "configured")
         software, boot_id = self._program

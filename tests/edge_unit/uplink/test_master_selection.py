@@ -121,7 +121,7 @@ def test_the_last_remaining_master_of_several_cells_is_not_chosen() -> None:
     left = Candidate(offer("two"), URL)
     taken, words = choose([left], {"one", "two"})
     assert taken is None
-    assert "masters of several cells were here (one, two)" in words
+    assert "masters of several cells were announced (one, two)" in words
     assert choose([left], {"two"})[0] is left
 
 

@@ -35,7 +35,7 @@ async def localise(search: BoardSearch, uplink: Uplink, assignment: Assignment, 
             uncertainty_deg=round(found.uncertainty_deg, 4),
             reprojection_px=round(found.reprojection_px, 4),
         )
-        await uplink.tell_pose(found.T_world_camera, "board", quality)
+        await uplink.report_pose(found.T_world_camera, "board", quality)
     except CellwatchError as error:
         # It retries without end, but warns once.
         logger.log(logging.WARNING if first else logging.DEBUG, "%s", error)

@@ -16,7 +16,7 @@ class CommandBatch:
 
     calibrations: list[Command] = field(default_factory=list)
     changes: list[Command] = field(default_factory=list)
-    pictures: list[Command] = field(default_factory=list)
+    images: list[Command] = field(default_factory=list)
 
     @classmethod
     def take(cls, queue: asyncio.Queue[Command]) -> CommandBatch:
@@ -30,7 +30,7 @@ class CommandBatch:
     def _kind(self, command: Command) -> list[Command]:
         if command.verb == "calibrate":
             return self.calibrations
-        return self.pictures if command.verb == "image" else self.changes
+        return self.images if command.verb == "image" else self.changes
 
 
 def put_back(queue: asyncio.Queue[Command], commands: Iterable[Command]) -> None:

@@ -28,7 +28,7 @@ class ImageRequests:
     def __init__(self, uplink: Uplink, assigned: AssignedPipeline, tasks: TaskGroup) -> None:
         self._uplink = uplink
         self._assigned = assigned
-        self._errands = tasks
+        self._tasks = tasks
 
     async def show(self, commands: Iterable[Command], frame: DepthFrame, joints: JointEstimate | None) -> None:
         """Draw the images that `commands` request, from the frame that was processed last."""
@@ -40,7 +40,7 @@ class ImageRequests:
             except InputError as error:
                 self._uplink.finish(command, Outcome("refused", str(error)))
             else:
-                self._errands.start(self._send(command, picture))
+                self._tasks.start(self._send(command, picture))
 
     def _draw(self, kind: ImageKind, frame: DepthFrame, joints: JointEstimate | None) -> NDArray[np.uint16]:
         if kind == "depth":
@@ -55,7 +55,7 @@ class ImageRequests:
         scale_m = self._assigned.camera.intrinsics.depth_scale_m
         try:
             png = await asyncio.to_thread(png_of, picture, scale_m, command.raw)
-            await self._uplink.send_picture(command, png)
+            await self._uplink.send_image(command, png)
         except CellwatchError as error:
             self._uplink.finish(command, Outcome("failed", str(error)))
         else:

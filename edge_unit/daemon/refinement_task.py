@@ -84,7 +84,7 @@ class RefinementTask:
             if found.accepted:
                 # If the camera was moved, its background model shows another place.
                 self._assigned.refined = None if self._monitor.verdict.moved else found.T_world_camera
-                await self._uplink.tell_pose(found.T_world_camera, "refined", PoseQuality())
+                await self._uplink.report_pose(found.T_world_camera, "refined", PoseQuality())
         except CellwatchError as error:
             self._uplink.finish(gathered.command, Outcome("failed", str(error)))
         else:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The daemon: source, pipeline and uplink held together.
+"""The daemon: source, pipeline and uplink together.
 
-Frames are processed one after the other in a thread, while the event loop talks to the master. What the master
-changes (settings, cell, pose) is an `Assignment`, applied between two frames; a report carries the one that it was
-made with, so that nothing is ever merged under another lattice, cell or pose than it was made for.
+Frames are processed one after the other in a worker thread, while the event loop talks to the master. Settings, cell
+and pose from the master form an `Assignment`, which is applied between two frames. A report carries the assignment that
+it was made with, so that nothing is merged under another lattice, cell or pose.
 """
 
 from __future__ import annotations
@@ -47,23 +47,23 @@ logger = logging.getLogger(__name__)
 
 REOPEN_MIN_S = 0.2
 REOPEN_MAX_S = 5.0
-"""Between attempts to open a camera that does not deliver."""
+"""Pause between attempts to open a camera that delivers no frames."""
 
 REHEARSAL_S = 5.0
-"""For kernels to be read from disk, on a busy machine."""
+"""Time to read kernels from disk, on a busy machine."""
 
 FRAME_S_MAX = 5.0
-"""For one frame, where nothing has to be prepared: a hundred times what the slowest board takes."""
+"""Time limit of one frame without preparation: a hundred times that of the slowest board."""
 
 PREPARE_S_MAX = 240.0
-"""For kernels to be compiled and a cell to be drawn anew on a board that has just begun to do both."""
+"""Time limit of a frame with preparation: kernels are compiled and the cell is drawn, on a board."""
 
 DRAIN_S = 2.0
-"""For the last frame of a recording to reach the master."""
+"""Time for the last frame of a recording to reach the master."""
 
 
 class Unit:
-    """One camera, one master; `run` until cancelled or until a recording ends."""
+    """A unit with one camera and one master; `run` lasts until it is cancelled, or until a recording ends."""
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class Unit:
         client: MasterClient | None = None,
         clock: Clock = LOOP_CLOCK,
     ) -> None:
-        """Read and open files, so make it before the event loop runs.
+        """Read and open files, so construct it before the event loop runs.
 
         `clock` is the clock of the source's `captured_at_ns`. Without `client` the unit makes one and searches for the
         master.
@@ -101,8 +101,8 @@ class Unit:
         self._trace = None if config.trace_path is None else Trace(config.trace_path)
         self._search = BoardSearch(source, config.board_stream, clock)
         self._work = self._frame_work()
-        self._errands = TaskGroup()
-        self._showing = ImageRequests(self.uplink, self._work.assigned, self._errands)
+        self._tasks = TaskGroup()
+        self._image_requests = ImageRequests(self.uplink, self._work.assigned, self._tasks)
         self._progress = StallDetector(clock)
         self._rehearsal: asyncio.Task[None] | None = None
         self._limiter = FrameLimiter(config.fps_max)
@@ -117,7 +117,7 @@ class Unit:
         return FrameProcessor(finish, assigned, learning, refining, stance, FrameJoints(self.uplink))
 
     async def run(self) -> None:
-        """Watch and report.
+        """Run the unit.
 
         Raises:
             ConfigError: there is no token.
@@ -135,23 +135,23 @@ class Unit:
                 for task in tasks:
                     task.cancel()
                 results = await asyncio.gather(*tasks, return_exceptions=True)
-                await self._errands.end()
+                await self._tasks.end()
                 if self._trace is not None:
                     await asyncio.to_thread(self._trace.close)
             for result in results:
                 if isinstance(result, Exception):
                     raise result
 
-    # ------------------------------------------------------------------ how it goes
+    # ------------------------------------------------------------------ status
 
     def status(self) -> str:
-        """One line for a person: camera, frames a second since it was asked last, master."""
+        """Status in one line: camera, frames a second since the last call, master."""
         trouble = self.uplink.camera_state.trouble
         line = self._status.line(None if trouble is None else trouble.sentence)
-        return f"{line}; {self.uplink.standing}"
+        return f"{line}; {self.uplink.status_text}"
 
     def stuck(self) -> str | None:
-        """What hangs and will not come to its end by itself; waiting for a camera or a master is not of that kind."""
+        """The work that hangs and does not end by itself; empty while the unit waits for a camera or a master."""
         return self._progress.stuck()
 
     def _note(self, report: Report, delivery: Delivery | None) -> None:
@@ -161,7 +161,7 @@ class Unit:
     # ------------------------------------------------------------------ the camera
 
     async def _watch(self) -> None:
-        """Take frames for as long as there are any; a camera that fails is opened again."""
+        """Take frames until there are no more; a camera that fails is opened again."""
         retry_s = REOPEN_MIN_S
         while True:
             try:
@@ -185,15 +185,15 @@ class Unit:
         if self._rehearsal is None:
             self._rehearsal = asyncio.create_task(asyncio.to_thread(self._rehearse))
         camera = await self._source.open()
-        # Who registers is live with the next frame; but a unit that has to compile first tells that it is there.
+        # A registered unit is live with its next frame, but one that must compile first registers before that.
         await done_within(REHEARSAL_S, self._rehearsal, self._clock)
         self._work.assigned.open(camera)
         await self._camera.opened(camera)
         await asyncio.gather(self.uplink.assigned.wait(), self._rehearsal)
         assignment = self.uplink.assignment
         if assignment is not None and assignment.T_world_camera is not None:
-            # Before the camera delivers, so that no frame has to wait for what is compiled and drawn only once.
-            # What cannot be prepared is told with each frame, for the master may change it.
+            # Before the camera delivers, so that no frame waits for compiling and drawing.
+            # A failure is reported with each frame, because the master may change its cause.
             with suppress(InputError), self._progress.working("preparing for frames", PREPARE_S_MAX):
                 await asyncio.to_thread(self._work.assigned.prepare, assignment, assignment.T_world_camera)
 
@@ -202,7 +202,7 @@ class Unit:
             warm_up_kernels()
 
     async def _end(self) -> None:
-        """A recording has no more frames."""
+        """Note the end of a recording."""
         await self.uplink.drained(DRAIN_S)
         if self._work.learning.progress is None:
             logger.info("the recording has come to its end")
@@ -212,57 +212,57 @@ class Unit:
     # ------------------------------------------------------------------ a frame
 
     async def _take(self, frame: DepthFrame) -> None:
-        """Do with one frame what its time, the master's assignment and its orders ask for."""
+        """Handle one frame as its time, the assignment and the commands require."""
         if not self._limiter.due(frame.captured_at_ns):
             return
         assignment = self.uplink.assignment or self._work.assigned.assignment
         if assignment is None:
             return
-        orders = CommandBatch.take(self.uplink.commands)
-        if orders.calibrations:
-            put_back(self.uplink.commands, (*orders.changes, *orders.pictures))
-            # The frame is of before the look, and its memory may be gone afterwards.
+        batch = CommandBatch.take(self.uplink.commands)
+        if batch.calibrations:
+            put_back(self.uplink.commands, (*batch.changes, *batch.images))
+            # The frame is older than the search, and its memory may be reused afterwards.
             outcome = await localise(self._search, self.uplink, assignment, frame)
-            self._finish(orders.calibrations, outcome)
+            self._finish(batch.calibrations, outcome)
         elif assignment.T_world_camera is None:
-            await self._look_for_pose(assignment, frame, orders)
+            await self._look_for_pose(assignment, frame, batch)
         else:
-            await self._filter(assignment, assignment.T_world_camera, frame, orders)
+            await self._filter(assignment, assignment.T_world_camera, frame, batch)
 
-    async def _look_for_pose(self, assignment: Assignment, frame: DepthFrame, orders: CommandBatch) -> None:
-        """Say that nobody knows where the camera stands, and look for the board now and then."""
+    async def _look_for_pose(self, assignment: Assignment, frame: DepthFrame, batch: CommandBatch) -> None:
+        """Report that the camera's pose is not known, and search for the board from time to time."""
         self._work.assigned.pipeline = None
-        self._finish(orders.changes, Outcome("refused", NO_POSE))
+        self._finish(batch.changes, Outcome("refused", NO_POSE))
         seen = self._search.outcome
         searching = Trouble("board", f"searching for the board: {seen}") if seen else None
         report = troubled(assignment, frame, searching)
         self._status.note_trouble(report.health.trouble or NO_POSE)
         self.uplink.offer(report)
-        await self._showing.show(orders.pictures, frame, None)
+        await self._image_requests.show(batch.images, frame, None)
         wanted = self._config.localise and assignment.cell.board is not None
         if wanted and self._search.due:
             await localise(self._search, self.uplink, assignment, frame)
 
     async def _filter(
-        self, assignment: Assignment, T_world_camera: Transform, frame: DepthFrame, orders: CommandBatch
+        self, assignment: Assignment, T_world_camera: Transform, frame: DepthFrame, batch: CommandBatch
     ) -> None:
-        """Process the frame and offer the result; nothing that follows delays it."""
+        """Process the frame and send the report; the tasks that follow do not delay it."""
         stages = StageTimer(frame.captured_at_ns, self._clock)
         stages.end("source")
         joints = await self._work.joints.at(assignment, frame)
         stages.end("joints")
-        prepared = assignment is self._work.assigned.assignment and not orders.changes and not orders.pictures
+        prepared = assignment is self._work.assigned.assignment and not batch.changes and not batch.images
         with self._progress.working(f"frame {frame.frame_number}", FRAME_S_MAX if prepared else PREPARE_S_MAX):
             if self._trace is not None:
                 await asyncio.to_thread(self._trace.flush)
             report = await asyncio.to_thread(
-                self._work.process, assignment, T_world_camera, frame, joints, orders.changes, stages
+                self._work.process, assignment, T_world_camera, frame, joints, batch.changes, stages
             )
         self._status.note_frame(report.health.trouble)
         self.uplink.offer(report)
-        await self._showing.show(orders.pictures, frame, joints)
+        await self._image_requests.show(batch.images, frame, joints)
         for task in self._work.afterwards(frame, joints, report):
-            self._errands.start(task)
+            self._tasks.start(task)
 
     def _finish(self, commands: list[Command], outcome: Outcome) -> None:
         for command in commands:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the master wants of a unit, and what the unit reports of a frame, as values."""
+"""The master's assignment of a unit, and the unit's report of a frame, as values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shared.wire import pack_seen
 
 @dataclass(frozen=True, eq=False)
 class Assignment:
-    """What the master wants of this unit: all that a frame is processed with."""
+    """The master's assignment of this unit: all that a frame is processed with."""
 
     session: int
     versions: Versions
@@ -29,45 +29,45 @@ class Assignment:
 
     @property
     def phase(self) -> Phase:
-        """How far a unit with this assignment has come."""
+        """Phase of a unit with this assignment."""
         return "localising" if self.T_world_camera is None else "live"
 
 
 class LatestAssignment:
-    """The one owner of the assignment: the master's latest, None while the unit is not registered."""
+    """The only owner of the assignment: the master's latest, None while the unit is not registered."""
 
     def __init__(self) -> None:
         self.value: Assignment | None = None
         self.there = asyncio.Event()
 
     def set(self, assignment: Assignment) -> None:
-        """Work with `assignment` from the next frame on."""
+        """Use `assignment` from the next frame on."""
         self.value = assignment
         self.there.set()
 
     def clear(self) -> None:
-        """Have none until the unit has registered again."""
+        """Remove the assignment until the unit has registered again."""
         self.value = None
         self.there.clear()
 
 
 class Trouble(NamedTuple):
-    """Why a unit reports no voxels: a code, a sentence, and how far it is with what is to be waited for."""
+    """The reason why a unit reports no voxels: a code, a sentence, and the progress of the task that ends it."""
 
     code: TroubleCode
     sentence: str
     progress: Progress | None = None
 
     def facts(self) -> dict[str, Any]:
-        """The fields of `Health` that tell it; a sentence that is too long is cut."""
+        """Return the fields of `Health` for this trouble; a sentence that is too long is cut."""
         return {"trouble": self.sentence[:MAX_TEXT], "trouble_code": self.code, "progress": self.progress}
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """One frame's result, and the assignment that it was made with. `seen` is None when nothing is known to be seen.
+    """The result of one frame, with the assignment that it was made with. `seen` is None if nothing is known of it.
 
-    `stages_ns` is how long the frame spent in each stage, of one that went through all of them.
+    `stages_ns` has the duration of each stage, for a frame that went through all of them.
     """
 
     assignment: Assignment
@@ -79,7 +79,7 @@ class Report:
 
 
 class Delivery(NamedTuple):
-    """When a report was sent, when the master had all of it, and when it had merged it: by the unit's clock, in ns."""
+    """Times at which a report was sent, received and merged, by the unit's clock, ns."""
 
     sent_at_ns: int
     received_at_ns: int
@@ -87,7 +87,7 @@ class Delivery(NamedTuple):
 
 
 def seen_report(seen: SeenBlocks) -> SeenReport:
-    """Return the blocks as a report, in larger ones where it would be too long."""
+    """Return the blocks as a report; with larger blocks if it would be too long."""
     while True:
         nx, ny, nz = seen.lattice.shape
         report = pack_seen(seen.seen.reshape(nx, ny, nz), seen.lattice.voxel_size_m)

@@ -18,23 +18,23 @@ from shared.messages import CellReference
 logger = logging.getLogger(__name__)
 
 MAX_MESHES = 1000
-"""Of one cell: more than the bodies and links that a cell may have."""
+"""Limit of meshes of one cell: more than the bodies and links that a cell may have."""
 
 
 class CellCache:
-    """One folder: the document of the last cell, and its meshes by their hashes."""
+    """A folder with the document of the last cell, and its meshes by their hashes."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._last: Cell | None = None
 
     async def get(self, reference: CellReference, client: MasterClient) -> Cell:
-        """The cell that the master watches, from disk as far as it is there; the same object while it does not change.
+        """Return the master's cell, read from disk as far as possible; the same object while it does not change.
 
         Raises:
-            UplinkError: the master does not give it.
-            WireError: what it gives is not that cell.
-            CellError: it is no cell.
+            UplinkError: the master does not send it.
+            WireError: the master sends another cell.
+            CellError: the document is not a cell.
         """
         if self._last is not None and self._last.version == reference.sha256:
             return self._last
@@ -59,7 +59,7 @@ class CellCache:
                     f"cell {reference.name}: expected version {reference.sha256[:8]}, got {cell.version[:8]}"
                 )
         except CellwatchError:
-            # The master's cell changed between its answer and ours, or what lies on disk is damaged: fetch all anew.
+            # The master's cell changed since its answer, or a file is damaged: fetch everything again.
             await asyncio.to_thread(self._keep_only, set())
             raise
         if fetched:
@@ -85,11 +85,11 @@ class CellCache:
         self._keep_only({f"{sha256}.json", *(f"{mesh}.mesh" for mesh in meshes)})
 
     def _write(self, name: str, data: bytes) -> None:
-        """Whole or not at all; a disk that is full costs the cache, not the unit."""
+        """Write a file whole or not at all; with a full disk the unit goes on without the cache."""
         path = self._folder / name
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            # What a power cut damages is found by its hash and fetched again; a start waits for no disk.
+            # A file that a power cut damaged is noticed by its hash and fetched again, so nothing waits for the disk.
             write_whole(path, data, synced=False)
         except OSError as error:
             logger.warning("%s: the cell cannot be kept: %s", path, error)
@@ -104,7 +104,7 @@ class CellCache:
 
 
 def mesh_hashes(document: dict[str, Any]) -> list[str]:
-    """The hashes that a cell's document names, wherever they stand: 64 hexadecimal digits under `mesh`."""
+    """Return the hashes that a cell's document names anywhere under `mesh`: 64 hexadecimal digits each."""
     found: set[str] = set()
     pending: list[Any] = [document]
     while pending:

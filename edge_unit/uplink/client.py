@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a unit can ask the master, each call one request; errors of HTTP become ours here."""
+"""The calls of a unit to the master, one request each; HTTP errors become errors of the project here."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ from shared.transforms import Transform
 from shared.wire import MAX_ANSWER_BYTES, MEDIA_TYPE, decode, decode_update_answer, encode, encode_update, unpack
 
 TIMEOUT = httpx.Timeout(2.0, connect=0.5)
-"""A master that takes longer is as good as gone: the next frame is worth more than the answer to this one.
+"""Timeout of a call: after it the next frame is worth more than the answer to this one.
 
-A connection that is asked for while the network is cut does not come when it heals, for the kernel asks again only
-after a second: so ask for another one before."""
+A connection that is requested while the network is cut is not established when the network returns, because the kernel
+retries only after a second. So a new connection is requested before that."""
 
 TRANSFER_TIMEOUT_S = 30.0
-"""For a mesh of MAX_MESH_BYTES over a network that is slow but works."""
+"""Timeout for a mesh of MAX_MESH_BYTES over a slow network."""
 
 MAX_MESH_BYTES = 128 * 2**20
-"""Of one mesh; a robot link has a hundredth of it."""
+"""Limit of one mesh; a robot link has a hundredth of it."""
 
 IMAGE_TIMEOUT_S = 5.0
-"""For a picture; whoever asked for it waits no longer."""
+"""Timeout for an image; the client that requested it waits no longer."""
 
 LIMITS = httpx.Limits(max_connections=4, max_keepalive_connections=4, keepalive_expiry=60.0)
-"""Update, joints, cell and pose may each be under way."""
+"""Limit of connections: an update, joints, the cell and a pose at the same time."""
 
 MSGPACK_BOTH_WAYS = {"Content-Type": MEDIA_TYPE, "Accept": MEDIA_TYPE}
 
 ERROR_CHARS = 300
-"""Of the master's reason."""
+"""Length limit of the master's reason."""
 
 
 class MasterClient:
@@ -66,18 +66,17 @@ class MasterClient:
         transport: httpx.AsyncBaseTransport | None = None,
         tls: ssl.SSLContext | None = None,
     ) -> None:
-        """`read_token` is asked at each registration; `source_address` is an own IP to connect from.
+        """Call `read_token` at each registration; connect from the own IP `source_address`.
 
-        `transport` carries the requests in place of a network. `tls` is what is asked of the master's certificate,
-        see `trust`; without, a master at https is held against the CAs of the system. With `url` None there is no
-        master until `aim` names one.
+        `transport` carries the requests in place of a network. `tls` checks the master's certificate; without it, a
+        certificate is checked against the CAs of the system. With `url` None there is no master until `aim` names one.
         """
         self._read_token = read_token
         self._tls = tls
         self.url = ""
-        """Empty: there is no master yet."""
+        """URL of the master; empty while there is none."""
         if transport is None:
-            # Also where this master speaks no TLS: another one may.
+            # Also if this master has no TLS, because another one may have it.
             transport = httpx.AsyncHTTPTransport(
                 verify=tls or tls_context(), local_address=source_address, limits=LIMITS
             )
@@ -89,15 +88,15 @@ class MasterClient:
         )
         if url is not None:
             self.aim(url)
-        # They would cost a hundred bytes in every update and tell the master nothing.
+        # These headers would add a hundred bytes to every update, without use for the master.
         for name in ("Accept", "Accept-Encoding", "Connection", "User-Agent"):
             del self._http.headers[name]
 
     def aim(self, url: str) -> None:
-        """Talk to the master at `url` from now on.
+        """Call the master at `url` from now on.
 
         Raises:
-            ConfigError: it is no URL, or not https although the master's certificate is to be checked.
+            ConfigError: `url` is not a URL, or not https although the master's certificate must be checked.
         """
         parts = urlsplit(url)
         if not parts.hostname:
@@ -120,22 +119,22 @@ class MasterClient:
         """Read the token again.
 
         Raises:
-            ConfigError: there is none.
+            ConfigError: there is no token.
         """
         token = await asyncio.to_thread(self._read_token)
         self._http.headers["Authorization"] = f"Bearer {token}"
 
     async def initialize(self, request: InitializeRequest) -> InitializeAnswer:
-        """Ask for a slot.
+        """Register for a slot.
 
-        Raises as `update`, and besides:
-            MasterRefused: the master speaks an older contract than the unit.
-            NewerContract: it speaks a newer one, and asks what this unit does not know.
+        Raises as `update`, and also:
+            MasterRefused: the master has an older contract than the unit.
+            NewerContract: the master has a newer contract, and its answer has a name that this unit does not know.
         """
         try:
             data = await self._call("POST", "/initialize", encode(request))
         except MasterRefused as error:
-            # All that a master of contract 5.0 has to say of a minor number.
+            # The only sign by which a master of contract 5.0 refuses a minor number.
             if error.status == 422 and error.detail.startswith("contract_minor:"):
                 raise self._older(0) from error
             raise
@@ -150,7 +149,7 @@ class MasterClient:
         return answer
 
     def _older(self, minor: int) -> MasterRefused:
-        """What a master of an older minor has refused, whether it knows or not."""
+        """Return the refusal by a master of an older minor, which may not say so itself."""
         ours = f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
         detail = f"contract: this master speaks version {CONTRACT_VERSION}.{minor}, this unit {ours}"
         return MasterRefused(f"{self.url}/initialize: {detail}; update the master first", 400, detail)
@@ -159,41 +158,41 @@ class MasterClient:
         """Report a frame.
 
         Raises:
-            MasterUnreachable: nobody answered in time.
-            MasterRefused: the master said no; `status` tells how.
-            WireError: the answer is none of ours.
+            MasterUnreachable: no answer came in time.
+            MasterRefused: the master refused; `status` is the HTTP status.
+            WireError: the answer is not one of the contract.
         """
         headers = {"Content-Type": MEDIA_TYPE}
         return decode_update_answer(await self._call("POST", "/update", encode_update(update), headers))
 
     async def robot(self, since_ns: int, timeout_s: float) -> RobotAnswer:
-        """Joints after `since_ns` by the master's clock. Raises as `update`."""
+        """Return the joints after `since_ns` by the master's clock. Raises as `update`."""
         data = await self._call("GET", f"/robot?since_ns={since_ns}", timeout=httpx.Timeout(timeout_s))
         return decode(RobotAnswer, data)
 
     async def put_pose(
         self, unit_id: int, T_world_camera: Transform, origin: str, quality: PoseQuality | None = None
     ) -> int:
-        """Tell where the camera is; returns the version of the pose. Raises as `update`."""
+        """Send the camera's pose; returns the version of the pose. Raises as `update`."""
         document = {"T_world_camera": T_world_camera.tolist(), "origin": origin, "quality": quality or PoseQuality()}
         request = PoseRequest.model_validate(document)
         data = await self._call("PUT", f"/units/{unit_id}/pose", encode(request))
         return decode(PoseAnswer, data).pose
 
     async def put_image(self, unit_id: int, kind: ImageKind, command_id: int, png: bytes) -> None:
-        """Send a picture that a command asks for. Raises as `update`."""
+        """Send an image that a command requests. Raises as `update`."""
         path = f"/units/{unit_id}/images/{kind}?command={command_id}"
         await self._call("PUT", path, png, {"Content-Type": "image/png"}, IMAGE_TIMEOUT_S)
 
     async def cell_document(self) -> dict[str, Any]:
-        """The cell's document. Raises as `update`."""
+        """Return the cell's document. Raises as `update`."""
         document = unpack(await self._call("GET", "/cell", timeout=TRANSFER_TIMEOUT_S), MAX_ANSWER_BYTES)
         if not isinstance(document, dict):
             raise WireError(f"cell: expected a document, got {type(document).__name__}")
         return document
 
     async def mesh(self, sha256: str) -> bytes:
-        """A mesh in its canonical bytes. Raises as `update`."""
+        """Return a mesh in its canonical bytes. Raises as `update`."""
         return await self._call("GET", f"/cell/meshes/{sha256}", timeout=TRANSFER_TIMEOUT_S, limit=MAX_MESH_BYTES)
 
     async def _call(
@@ -223,6 +222,6 @@ class MasterClient:
 
 
 def _reason(body: bytearray) -> str:
-    """The one sentence of a refusal, whichever way it was encoded."""
+    """Return the sentence of a refusal, in either encoding."""
     text = bytes(body[:ERROR_CHARS]).decode("utf-8", "replace")
     return text.removeprefix('{"detail":"').removesuffix('"}')

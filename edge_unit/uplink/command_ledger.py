@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The master's commands: those that wait, those that are being carried out, and what became of the others.
+"""The master's commands: those that wait, those that are being carried out, and the outcomes of the others.
 
-`finish` is the one door by which the thread that works on frames tells the event loop anything; all else here belongs
-to the loop.
+`finish` is the only way by which the worker thread passes anything to the event loop; everything else here belongs to
+the loop.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from shared.messages import DONE, MAX_COMMANDS, Command, Ended, Outcome
 
 
 class CommandLedger:
-    """One session's commands.
+    """The commands of one session.
 
     Attributes:
-        waiting: those that nobody has taken yet.
+        waiting: commands that were not taken yet.
     """
 
     def __init__(self) -> None:
@@ -28,18 +28,18 @@ class CommandLedger:
         self._ended: list[Ended] = []
 
     def accept(self, commands: Iterable[Command]) -> None:
-        """Have new commands wait; the master sends again what finds no room."""
+        """Add new commands; the master sends those again that find no room."""
         for command in commands:
             if command.id not in self._open and not self.waiting.full():
                 self._open[command.id] = command
                 self.waiting.put_nowait(command)
 
     def finish(self, command: Command, outcome: Outcome = DONE) -> None:
-        """Tell the master with the next update what became of a command; from any thread."""
+        """Report the outcome of a command with the next update; may be called from any thread."""
         self._finished.put(Ended.of(command.id, outcome))
 
     def ended(self) -> tuple[Ended, ...]:
-        """Return what the master is to be told now, at most MAX_COMMANDS."""
+        """Return the outcomes for the next update, at most MAX_COMMANDS."""
         while True:
             try:
                 ended = self._finished.get_nowait()
@@ -49,13 +49,13 @@ class CommandLedger:
                 self._ended.append(ended)
 
     def forget(self, told: Iterable[Ended]) -> None:
-        """Forget what the master has heard."""
+        """Remove the outcomes that the master has received."""
         for ended in told:
             self._ended.remove(ended)
             self._open.pop(ended.id, None)
 
     def clear(self) -> None:
-        """Forget the session's commands; the master sends again what it still wants."""
+        """Remove the session's commands; the master sends those again that it still needs."""
         self._open.clear()
         self.ended()
         self._ended.clear()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looks for the master while it is not known or does not answer, and is silent while it does.
+"""The search for a master that is not known or does not answer; silent while the master answers.
 
-A place is only taken when somebody listens there who passes for the master: with `master_ca` or `master_fingerprint`
-that is a TLS handshake with the right certificate, and whoever fails it hears no more of us, not even a request.
+An address is used only if a master is verified there: with `master_ca` or `master_fingerprint` by a TLS handshake with
+the right certificate. A server that fails it receives no request.
 """
 
 from __future__ import annotations
@@ -37,34 +37,34 @@ from shared.waiting import LOOP_CLOCK, Clock, wait_set, within
 logger = logging.getLogger(__name__)
 
 LOST_S = 2.0
-"""A master that is restarted is back sooner; then others are looked for."""
+"""Time without an answer after which other masters are searched; a restarted master is back sooner."""
 
 LOOK_S = 2.0
-"""Between looks, unless somebody new is heard of."""
+"""Pause between two searches, unless a new master is announced."""
 
 HEAR_S = 1.0
-"""From the first master that is heard of to the choice: others answer within a fifth of a second."""
+"""Time from the first announcement to the choice; others answer within a fifth of a second."""
 
 HEAR_FIRST_S = 2.0
-"""... where it is a choice among all cells, and for good: all are asked again after one second, and then after five."""
+"""The same for a permanent choice among all cells: masters are queried again after one second, and then after five."""
 
 REACH_S = 1.0
-"""For a connection; a master on our own network takes a hundredth of it, a board that is busy ten times that."""
+"""Timeout of a connection; a master on the own network needs a hundredth of it, a busy board a tenth."""
 
 VAIN_S = 30.0
-"""Where a master was tried in vain it is not tried again so soon."""
+"""Pause before an address is tried again that did not answer."""
 
 TELL_S = 10.0
-"""Between lines in the journal about what is found; anyone on the network could have us write them."""
+"""Pause between two log lines about masters; anyone on the network could cause them."""
 
 FILE_NAME = "master.json"
 
 
 class MasterSearch:
-    """Where the master is. Whoever talks to it says whether it answers; `run` looks for another when it does not."""
+    """The address of the master. The uplink reports whether it answers; `run` searches for another one if not."""
 
     def __init__(self, config: UnitConfig, clock: Clock = LOOP_CLOCK) -> None:
-        """Read files, so make it before the event loop runs.
+        """Read files, so construct it before the event loop runs.
 
         Raises:
             ConfigError: `master_ca` cannot be read or holds no certificate.
@@ -82,34 +82,34 @@ class MasterSearch:
         self._answered_once = False
         self._vain: dict[str, int] = {}
         self._cells: set[str] = set()
-        # The last line in the journal, and its time.
+        # The last log line, and its time.
         self._logged = "", clock.now_ns() - round(TELL_S * NS_PER_S)
         self.outcome = "no master is configured, and none was known before"
-        """What was found last, in words."""
+        """Result of the last search, in words."""
         if self._place is None:
             self._lost.set()
 
     @property
     def lost(self) -> bool:
-        """Whether it looks."""
+        """True while the master is lost and the search runs."""
         return self._lost.is_set()
 
     async def place(self) -> Place:
-        """Where to turn to now; waits while nobody knows."""
+        """Return the address to use now; waits until there is one."""
         while self._place is None:
             self._found.clear()
             await self._found.wait()
         return self._place
 
     def answered(self, url: str) -> None:
-        """The master at `url` answers."""
+        """Note that the master at `url` answers."""
         if self._place is not None and self._place.url == url:
             self._silent_since_ns = None
             self._answered_once = True
             self._lost.clear()
 
     async def keep(self, url: str, cell: str) -> None:
-        """The master at `url` has taken us in, and watches `cell`: the one to return to, also after a restart."""
+        """Note that the master at `url` registered this unit and watches `cell`; a restarted unit returns to it."""
         if self._place is None or self._place.url != url:
             return
         kept = Kept(url, cell, self._place.found_by, self._wanted.url)
@@ -118,14 +118,14 @@ class MasterSearch:
             await asyncio.to_thread(save_kept, self._path, kept)
 
     def unanswered(self, now_ns: int) -> None:
-        """The master does not answer, or is none for us."""
+        """Note that the master does not answer, or refuses this unit."""
         if self._silent_since_ns is None:
             self._silent_since_ns = now_ns
         elif now_ns - self._silent_since_ns >= LOST_S * NS_PER_S:
             self._lost.set()
 
     async def run(self) -> None:
-        """Look whenever it is lost, until cancelled."""
+        """Search whenever the master is lost, until cancelled."""
         while True:
             await self._lost.wait()
             began_ns = none_since_ns = self._clock.now_ns()
@@ -142,7 +142,7 @@ class MasterSearch:
                         await wait_set(browser.changed, LOOK_S if heard else HEAR_S, self._clock)
 
     async def _look(self, offers: Sequence[Offer] | None) -> None:
-        """Take another place, if there is one that will do; None: it is too early to choose among offers."""
+        """Use another address if one is suitable; returns None if it is too early to choose among offers."""
         now_ns = self._clock.now_ns()
         self._vain = {url: at_ns for url, at_ns in self._vain.items() if now_ns - at_ns < VAIN_S * NS_PER_S}
         before = [first_place(self._wanted, None), first_place(Wanted(), self._kept)]
@@ -155,7 +155,7 @@ class MasterSearch:
         tried = [url for offer in offers for url in offer.urls if not self._new(url)]
         candidates = await judged(offers, self._wanted, self._kept, self._tls, self._source_address, tried)
         if self._any_cell and len(self._cells) < MAX_OFFERS:
-            # Who is not believed counts for nothing; who is merely slow to answer is there nevertheless.
+            # A master that failed the check does not count; one that is only slow to answer does.
             ours = [one.offer for one in candidates if one.url is not None] if self._wanted.checked else offers
             self._cells |= {one.says.cell for one in ours if objection(one, self._wanted, self._kept) is None}
         chosen, self.outcome = choose(candidates, self._cells)
@@ -169,14 +169,14 @@ class MasterSearch:
 
     @property
     def _any_cell(self) -> bool:
-        """Whether nothing says which cell's master is ours."""
+        """True if nothing says which cell's master is the right one."""
         return self._kept is None and self._wanted.cell is None
 
     async def _reach(self, url: str) -> str | None:
         return await reach(url, self._tls, self._source_address)
 
     def _new(self, url: str) -> bool:
-        """Whether it is worth a try: neither where we are, nor where we were in vain a moment ago."""
+        """Return True unless the address is the present one, or failed a moment ago."""
         return url not in self._vain and (self._place is None or url != self._place.url)
 
     def _take(self, place: Place) -> None:
@@ -190,13 +190,13 @@ class MasterSearch:
 
 
 def wanted_of(config: UnitConfig) -> Wanted:
-    """What a configuration says of the master."""
+    """Return the part of the configuration about the master."""
     url = None if config.master_url is None else config.master_url.rstrip("/")
     return Wanted(url, config.cell, config.checks_master, config.master_fingerprint)
 
 
 def kept_of(config: UnitConfig) -> Kept | None:
-    """The master that took this unit in last, if the configuration still lets it go there."""
+    """Return the master that registered this unit last, if the configuration still allows it."""
     kept = load_kept(config.state_dir / FILE_NAME)
     return None if kept is None or distrusted(kept, wanted_of(config)) else kept
 
@@ -209,7 +209,7 @@ async def judged(
     source_address: str | None,
     passed_over: Sequence[str] = (),
 ) -> list[Candidate]:
-    """Each offer with what speaks against it, or where it was reached; URLs in `passed_over` are not tried."""
+    """Return each offer with the objection or the URL at which it answered; URLs in `passed_over` are not tried."""
     own = own_addresses()
 
     async def candidate(offer: Offer) -> Candidate:
@@ -228,7 +228,7 @@ async def judged(
 
 
 async def reach(url: str, tls: ssl.SSLContext, source_address: str | None) -> str | None:
-    """Why nobody is at `url` who passes for a master, or None; nothing is sent but a handshake."""
+    """Return the reason why no master is verified at `url`, or None if one is; sends no more than a handshake."""
     parts = urlsplit(url)
     local = None if source_address is None else (source_address, 0)
 
@@ -245,12 +245,12 @@ async def reach(url: str, tls: ssl.SSLContext, source_address: str | None) -> st
 
 
 def load_kept(path: Path) -> Kept | None:
-    """The master that answered last, or None; a damaged file is as good as none."""
+    """Return the master that answered last; None if there is none or the file is damaged."""
     return StateFile(path).load(_kept_of_document)
 
 
 def save_kept(path: Path, kept: Kept) -> None:
-    """Remember a master; where nothing can be written nothing is remembered, and a warning says so."""
+    """Store a master; if the file cannot be written, a warning says so."""
     StateFile(path).save(dataclasses.asdict(kept))
 
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of the masters that were heard of is ours, decided from what is configured, kept and heard; no network here.
+"""The choice among masters, by configuration, by the last master, and by announcements; without any network access.
 
-    configured   master_url, first in any case
+    configured   master_url, always first
     kept         the last master that answered
-    announced    ... if it watches our cell and may be believed as much as the one before, and is the only such
+    announced    the only master that watches this unit's cell and is checked as well as the one before
 
-A foreign cell's master is taken only by a unit that was never told and never had another.
+A unit registers at the master of an unknown cell only if it has no configured cell and never had another master.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from shared.messages import CONTRACT_MINOR, CONTRACT_VERSION
 
 @dataclass(frozen=True)
 class Place:
-    """Where a master is, in the form of a URL, and how that is known."""
+    """URL of a master, and its origin."""
 
     url: str
     found_by: str
@@ -29,7 +29,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Kept:
-    """The last master that took us in: where, which cell it watched, how it was found, and the master_url of then."""
+    """The last master that registered this unit: its URL, its cell, its origin, and the master_url at that time."""
 
     url: str
     cell: str
@@ -39,7 +39,7 @@ class Kept:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the configuration says of the master. With `checked`, it is known by its certificate."""
+    """The configuration about the master. With `checked`, the master is verified by its certificate."""
 
     url: str | None = None
     cell: str | None = None
@@ -49,7 +49,7 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A master that was heard of; `url` is where it was reached, `objection` why it is not for us."""
+    """A master that was announced; `url` is where it answered, `objection` the reason why it is not suitable."""
 
     offer: Offer
     url: str | None = None
@@ -62,14 +62,14 @@ class Candidate:
 
 
 def first_place(wanted: Wanted, kept: Kept | None) -> Place | None:
-    """Where to go before anything is heard; None when nobody knows."""
+    """Return the address to use before any announcement; None if there is none."""
     if wanted.url is not None:
         return Place(wanted.url, "configured")
     return None if kept is None or distrusted(kept, wanted) else Place(kept.url, "as before")
 
 
 def distrusted(kept: Kept, wanted: Wanted) -> bool:
-    """Whether the configuration has changed so that the master of before will not do."""
+    """Return True if the configuration changed so that the last master is not suitable any more."""
     if wanted.checked and not kept.url.startswith("https://"):
         return True
     if wanted.url is not None and wanted.url != kept.configured:
@@ -78,7 +78,7 @@ def distrusted(kept: Kept, wanted: Wanted) -> bool:
 
 
 def objection(offer: Offer, wanted: Wanted, kept: Kept | None) -> str | None:
-    """Why this master is not for us, or None; what it says of itself is only ever held against it."""
+    """Return the reason why this master is not suitable, or None. An announcement can only speak against a master."""
     says = offer.says
     if says.contract != CONTRACT_VERSION or says.minor < CONTRACT_MINOR:
         older = "this unit" if says.contract > CONTRACT_VERSION else "the master"
@@ -100,10 +100,10 @@ def objection(offer: Offer, wanted: Wanted, kept: Kept | None) -> str | None:
 
 
 def choose(candidates: Sequence[Candidate], cells: Collection[str] = ()) -> tuple[Candidate | None, str]:
-    """The one to take, if it is the only one that was reached and will do; and what was found, in words.
+    """Return the only suitable master that answered, and the result of the search in words.
 
-    `cells` are those whose masters would have done until now: where there were several, the last one that is left is
-    no better than the others were.
+    `cells` are those whose masters were suitable until now: if there were several, the last one that is left is not
+    chosen either.
     """
     if not candidates:
         return None, "no master is announced on this network"
@@ -119,9 +119,9 @@ def choose(candidates: Sequence[Candidate], cells: Collection[str] = ()) -> tupl
 
 
 def in_order(urls: Sequence[str], own: Sequence[IPv4Interface]) -> list[str]:
-    """A master's URLs, the likeliest first: in one of our own networks, then beyond, then at an address of our own.
+    """Return a master's URLs, likeliest first: in an own network, then beyond, then at an address of this machine.
 
-    The same private address may be many machines' own, so it is this machine only where nothing else answers.
+    Many machines may have the same private address, so it means this machine only if nothing else answers.
     """
 
     def rank(url: str) -> int:

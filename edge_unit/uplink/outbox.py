@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report that is sent next: a slot of one, so that a slow network costs frames and never delay."""
+"""The next report: a queue of one, so that a slow network drops frames and adds no delay."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from shared.waiting import LOOP_CLOCK, Clock, wait_set, within
 logger = logging.getLogger(__name__)
 
 HEARTBEAT_S = 0.2
-"""Without a new frame the last report is sent again, often enough for the shortest sensible staleness."""
+"""Interval in which the last report is sent again without a new frame; shorter than any useful limit of age."""
 
 
 class Outbox:
-    """Latest-only.
+    """A latest-only queue of one report.
 
     Attributes:
-        last: the report that was sent last, to be sent again while no new one comes.
+        last: the report that was sent last; it is sent again while there is no new one.
     """
 
     def __init__(self, on_sent: Callable[[Report, Delivery | None], None], clock: Clock = LOOP_CLOCK) -> None:
@@ -35,11 +35,11 @@ class Outbox:
 
     @property
     def empty(self) -> bool:
-        """True while nothing new is to be sent."""
+        """True if there is no new report."""
         return self._fresh is None
 
     def offer(self, report: Report) -> None:
-        """Send this next; what was offered before and not sent yet is dropped."""
+        """Send this report next; an earlier one that was not sent yet is dropped."""
         if self._fresh is not None:
             self._on_sent(self._fresh, None)
         self._fresh = report
@@ -47,39 +47,39 @@ class Outbox:
         self._wake.set()
 
     def take(self) -> Report | None:
-        """Return what was offered, which is out of the slot then."""
+        """Take the report out of the queue."""
         fresh, self._fresh = self._fresh, None
         return fresh
 
     def sent(self, report: Report, delivery: Delivery | None) -> None:
-        """Tell of a report that was taken how it reached the master, or None: it never did."""
+        """Note the delivery of a report that was taken, or None if it did not reach the master."""
         self._on_sent(report, delivery)
 
     def put_back(self, report: Report | None) -> None:
-        """Try again what could not be sent, unless a newer one came meanwhile."""
+        """Put a report back that could not be sent, unless there is a newer one."""
         if self._fresh is None:
             self._fresh = report
         elif report is not None:
             self._on_sent(report, None)
 
     def drop(self) -> None:
-        """Send nothing of what was offered."""
+        """Drop the report."""
         if self._fresh is not None:
             self._on_sent(self._fresh, None)
             self._fresh = None
         self._idle.set()
 
     def settle(self) -> None:
-        """Note that an exchange ended: with nothing new, all is sent."""
+        """Note that an exchange ended; without a new report everything is sent."""
         if self._fresh is None:
             self._idle.set()
 
     def wake(self) -> None:
-        """End the wait for something to be sent."""
+        """End a wait for a report."""
         self._wake.set()
 
     async def woken(self, *, heartbeat: bool = True) -> None:
-        """Wait until something is to be sent, with `heartbeat` no longer than until the next one."""
+        """Wait for a report; with `heartbeat` no longer than until the next heartbeat."""
         self._wake.clear()
         if heartbeat:
             await wait_set(self._wake, HEARTBEAT_S, self._clock)
@@ -87,6 +87,6 @@ class Outbox:
             await self._wake.wait()
 
     async def drained(self, timeout_s: float) -> None:
-        """Wait until nothing is left to be sent, but no longer than `timeout_s`."""
+        """Wait until everything is sent, but no longer than `timeout_s`."""
         if not await within(timeout_s, self._idle.wait(), self._clock):
             logger.warning("the last frame did not reach the master")

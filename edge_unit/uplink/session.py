@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What holds from one registration at a master to the next."""
+"""The state from one registration at a master to the next."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ class Session:
     """One registration; before the first, `id` is 0.
 
     Attributes:
-        id: the unit's, as the master numbers it.
-        sequence: of the update that was sent last.
-        master_minor: the minor of the contract that the master speaks.
-        clock: how far the master's clock is from this unit's.
-        exchange: the times of the last question and answer.
+        id: the unit's number at the master.
+        sequence: number of the last update.
+        master_minor: minor of the master's contract.
+        clock: offset of the master's clock from this unit's.
+        exchange: times of the last request and answer.
         acknowledged: the seen report that the master is known to hold: its versions and packed bits.
     """
 
@@ -31,17 +31,17 @@ class Session:
 
     @classmethod
     def begun(cls, slot: InitializeAnswer | SlotAnswer, sent_at_ns: int, returned_at_ns: int) -> Session:
-        """Begin with the answer to a registration that was sent at `sent_at_ns`; it came at `returned_at_ns`."""
+        """Begin a session with the answer to a registration, sent at `sent_at_ns` and answered at `returned_at_ns`."""
         session = cls(id=slot.id, master_minor=slot.contract_minor)
         session.note(sent_at_ns, slot, returned_at_ns)
         return session
 
     def next_sequence(self) -> int:
-        """Number the next update."""
+        """Return the number of the next update."""
         self.sequence += 1
         return self.sequence
 
     def note(self, sent_at_ns: int, answer: InitializeAnswer | SlotAnswer | UpdateAnswer, returned_at_ns: int) -> None:
-        """Take in the times of a request that was sent at `sent_at_ns`; its answer came at `returned_at_ns`."""
+        """Note the times of a request that was sent at `sent_at_ns` and answered at `returned_at_ns`."""
         self.exchange = Exchange(sent_at_ns, answer.received_at_ns, answer.answered_at_ns, returned_at_ns)
         self.clock.add(self.exchange)

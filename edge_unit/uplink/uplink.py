@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exchange with the master: register, then report the latest frame, for ever.
+"""The exchange with the master: register, then report the latest frame, without end.
 
-A slot of one: a report that was not sent yet is replaced by a newer one, so that a slow network costs frames and
-never delay. Whatever goes wrong, it registers again; the master may have been restarted, or may be another.
+Reports are latest-only: a newer one replaces one that was not sent yet, so that a slow network drops frames and adds
+no delay. After any failure the unit registers again, because the master may have been restarted or replaced.
 
-How far it has come is its phase; each has its own way of trying again, and each change is one line in the journal:
+Each phase has its own way of retrying, and each change of phase is one line in the log:
 
     searching ───► registering ───► fetching ───► localising ───► live
      for a place    at that place    the cell      the camera,     every frame
@@ -73,27 +73,28 @@ logger = logging.getLogger(__name__)
 
 RETRY_MIN_S = 0.05
 RETRY_MAX_S = 0.25
-"""A master that returns has its units back within a second, a connection just asked for in vain included."""
+"""Longest pause between retries: a master that returns has its units back within a second."""
 
 JOINTS_TIMEOUT_S = 0.02
-"""For joints newer than the last update brought; a frame is not held up longer for them."""
+"""Timeout for joints newer than those of the last update; a frame waits no longer for them."""
 
 NOT_OURS = frozenset({400, 401, 403, 404, 405, 426})
-"""Who answers a registration like this is no master for us: of another contract or token, or none at all."""
+"""Refusals by a server that is not this unit's master: another contract, another token, or no master at all."""
 
 CONTRACT_RETRY_MIN_S, CONTRACT_RETRY_MAX_S = 5.0, 300.0
-"""Pauses before this unit registers again at a newer master that it does not understand and that reports no change.
+"""Pauses before this unit registers again at a newer master that it does not understand.
 
-They double: what helps is an update of this unit, which starts it anew, or a change at the master, which it reports.
+They double, because registering again seldom helps: an update of this unit restarts it, and a change at the master is
+reported with its answers.
 """
 
 START_OVER = frozenset({401, 403, 404, 409})
-"""The master does not know this token, unit, session or address any more: register again."""
+"""Answers after which the unit registers again: the master does not know its token, id, session or address any more."""
 
 
 @dataclass(frozen=True)
-class _Unclear:
-    """A session of which this unit does not understand all that it would have to obey."""
+class _NotUnderstood:
+    """A session whose settings, cell or pose this unit does not understand completely."""
 
     session: int
     versions: Versions
@@ -103,8 +104,8 @@ class _Unclear:
 
 
 @dataclass
-class _Told:
-    """What the journal was told last, so that it is not told again with each attempt."""
+class _Logged:
+    """The last log lines, so that they are not repeated with each attempt."""
 
     complaint: str = ""
     refused: str = ""
@@ -114,26 +115,26 @@ class _Told:
 
 @dataclass
 class CameraState:
-    """The camera's trouble and warning, which go along with each update whatever the report's frame told."""
+    """The camera's trouble and warning; they are part of each update, whatever the health of its frame."""
 
     trouble: Trouble | None = None
     warning: str | None = None
 
     def facts(self) -> dict[str, Any]:
-        """Return the fields of `Health` that tell it; empty where all is well."""
+        """Return the fields of `Health`; empty without trouble and warning."""
         facts = {} if self.trouble is None else self.trouble.facts()
         return facts if self.warning is None else facts | {"warning": self.warning}
 
 
-class _Presented(NamedTuple):
-    """The camera to register with, and the pose that the master is told: `T_world_camera` and where it is from."""
+class _RegisteringCamera(NamedTuple):
+    """The camera to register with, and the pose to report: `T_world_camera` and its origin."""
 
     camera: CameraInfo
     known_pose: tuple[Transform, ReportedOrigin] | None
 
 
 class Uplink:
-    """Registers and reports in the background; `run` never returns."""
+    """Registration and reports in the background; `run` never returns."""
 
     def __init__(
         self,
@@ -145,30 +146,30 @@ class Uplink:
         search: MasterSearch | None = None,
         clock: Clock = LOOP_CLOCK,
     ) -> None:
-        """`on_sent` is told of each report how it reached the master; None: it never did.
+        """Call `on_sent` with each report and its delivery; None if it did not reach the master.
 
-        `search` tells where the master is; without, it is where the client was aimed at, for ever. `clock` is the
-        unit's clock; the timeouts of requests are the client's own.
+        `search` finds the master's address; without it the client's URL stays. `clock` is the unit's clock; timeouts of
+        requests are the client's own.
         """
         self._client = client
         self._time = clock
         self.search = search
         self._cells = cells
         self._program = software, boot_id
-        self._presented: _Presented | None = None
+        self._registering_camera: _RegisteringCamera | None = None
         self._outbox = Outbox(on_sent, clock)
         self._ledger = CommandLedger()
         self._session = Session()
         self._latest = LatestAssignment()
-        self._unclear: _Unclear | None = None
-        self._told = _Told()
+        self._not_understood: _NotUnderstood | None = None
+        self._logged = _Logged()
         self.phase: Phase | None = None
         self.joints = JointHistory()
         self.camera_state = CameraState()
 
     @property
     def assignment(self) -> Assignment | None:
-        """What the master wants of this unit; None while it is not registered."""
+        """The master's assignment of this unit; None while the unit is not registered."""
         return self._latest.value
 
     @property
@@ -178,46 +179,46 @@ class Uplink:
 
     @property
     def commands(self) -> asyncio.Queue[Command]:
-        """The master's commands that nobody has taken yet."""
+        """The master's commands that were not taken yet."""
         return self._ledger.waiting
 
     @property
     def clock(self) -> ClockOffset:
-        """How far the master's clock is from this unit's, in this session."""
+        """Offset of the master's clock from this unit's, in this session."""
         return self._session.clock
 
-    # ------------------------------------------------------------------ what the unit calls
+    # ------------------------------------------------------------------ called by the unit
 
     def set_camera(self, camera: CameraInfo, known_pose: tuple[Transform, ReportedOrigin] | None) -> None:
-        """This is the camera to register with; another one than before means registering again.
+        """Set the camera to register with; with another camera the unit registers again.
 
-        `known_pose` (`T_world_camera` and where it is from) is told to the master, which may know better.
+        `known_pose` (`T_world_camera` and its origin) is reported to the master, which may have a better one.
         """
-        before = None if self._presented is None else self._presented.camera
+        before = None if self._registering_camera is None else self._registering_camera.camera
         if before is not None and (before.serial, before.intrinsics) != (camera.serial, camera.intrinsics):
             self._start_over()
-        self._presented = _Presented(camera, known_pose)
+        self._registering_camera = _RegisteringCamera(camera, known_pose)
         self._outbox.wake()
 
     def offer(self, report: Report) -> None:
-        """Report this next; what was offered before and not sent yet is dropped."""
+        """Send this report next; an earlier one that was not sent yet is dropped."""
         self._outbox.offer(report)
 
     def finish(self, command: Command, outcome: Outcome = DONE) -> None:
-        """Tell the master with the next update what became of a command; from any thread."""
+        """Report the outcome of a command with the next update; may be called from any thread."""
         self._ledger.finish(command, outcome)
 
-    async def send_picture(self, command: Command, png: bytes) -> None:
-        """Send the picture that a command asks for. Raises as `MasterClient.update`."""
+    async def send_image(self, command: Command, png: bytes) -> None:
+        """Send the image that a command requests. Raises as `MasterClient.update`."""
         assert command.image is not None
         await self._client.put_image(self._session.id, command.image, command.id, png)
 
-    async def tell_pose(self, T_world_camera: Transform, origin: str, quality: PoseQuality) -> None:
-        """This unit's camera was found to be there; the next frame is processed with it.
+    async def report_pose(self, T_world_camera: Transform, origin: str, quality: PoseQuality) -> None:
+        """Report a pose that was found for this unit's camera, and use it from the next frame on.
 
         Raises:
-            UplinkError: the master did not hear of it, or refused it.
-            WireError: its answer is none of ours.
+            UplinkError: the report did not reach the master, or was refused.
+            WireError: the answer is not one of the contract.
         """
         assignment = self.assignment
         version = await self._client.put_pose(self._session.id, T_world_camera, origin, quality)
@@ -226,24 +227,24 @@ class Uplink:
             self._assign(replace(self.assignment, versions=versions, T_world_camera=T_world_camera))
 
     @property
-    def standing(self) -> str:
-        """How it stands with the master, in words for a person."""
+    def status_text(self) -> str:
+        """State of the exchange with the master, in words for a person."""
         if self.search is not None and not self._client.url:
             return f"no master: {self.search.outcome}"
-        if self._told.complaint:
-            return f"no master: {self._told.complaint}"
-        if self._unclear is not None:
-            return self._unclear.trouble.sentence
+        if self._logged.complaint:
+            return f"no master: {self._logged.complaint}"
+        if self._not_understood is not None:
+            return self._not_understood.trouble.sentence
         if self.assignment is None:
             return f"not registered yet at {self._client.url}"
         return f"unit {self._session.id} at {self._client.url}"
 
     async def drained(self, timeout_s: float) -> None:
-        """Wait until nothing is left to be sent, but no longer than `timeout_s`."""
+        """Wait until everything is sent, but no longer than `timeout_s`."""
         await self._outbox.drained(timeout_s)
 
     async def refresh_joints(self, at_master_ns: int) -> None:
-        """Ask for joints up to `at_master_ns` if none so new are known; what cannot be had in time is done without."""
+        """Request joints up to `at_master_ns` if there are none so new; goes on without them after the timeout."""
         if self.joints.newest_ns >= at_master_ns or self.assignment is None:
             return
         try:
@@ -260,35 +261,35 @@ class Uplink:
         retry_s = RETRY_MIN_S
         while True:
             try:
-                await self._turn_to_master()
+                await self._select_master()
                 assignment = self.assignment
-                if self._unclear is not None:
-                    await self._tell_unclear(self._unclear)
+                if self._not_understood is not None:
+                    await self._report_not_understood(self._not_understood)
                 elif assignment is None:
                     await self._register()
                 else:
                     await self._report(assignment)
-                retry_s, self._told.complaint = RETRY_MIN_S, ""
+                retry_s, self._logged.complaint = RETRY_MIN_S, ""
                 if self.search is not None:
                     self.search.answered(self._client.url)
                 if self.phase == "searching" and self.assignment is not None:
                     self._enter(self.assignment.phase, f"{self._client.url} answers again")
             except MasterRefused as error:
-                registered = self.assignment is not None or self._unclear is not None
+                registered = self.assignment is not None or self._not_understood is not None
                 if error.status in START_OVER and registered:
                     self._start_over()
-                self._miss(error, error.status in NOT_OURS and self.assignment is None)
+                self._note_failure(error, error.status in NOT_OURS and self.assignment is None)
                 retry_s = await self._wait(retry_s, error)
             except CellwatchError as error:
-                foreign = isinstance(error, WireError) and self.assignment is None and self._unclear is None
+                foreign = isinstance(error, WireError) and self.assignment is None and self._not_understood is None
                 if isinstance(error, (WireError, CellError)) and self._session.master_minor > CONTRACT_MINOR:
-                    # What registering anew cannot clear up is told as trouble then.
+                    # If the next registration fails likewise, it is reported as trouble.
                     self._start_over()
-                self._miss(error, foreign or isinstance(error, MasterUnreachable))
+                self._note_failure(error, foreign or isinstance(error, MasterUnreachable))
                 retry_s = await self._wait(retry_s, error)
 
-    async def _turn_to_master(self) -> None:
-        """To another one, if another was found; while none is known at all, wait."""
+    async def _select_master(self) -> None:
+        """Turn to another master if one was found; wait while there is none."""
         if self.search is None:
             return
         if not self._client.url:
@@ -296,18 +297,18 @@ class Uplink:
         place = await self.search.place()
         if place.url != self._client.url:
             self._client.aim(place.url)
-            self._told.found_by = place.found_by
+            self._logged.found_by = place.found_by
             self._start_over()
 
-    def _miss(self, error: CellwatchError, lost: bool) -> None:
-        """What went wrong may mean that the master is elsewhere."""
+    def _note_failure(self, error: CellwatchError, lost: bool) -> None:
+        """Note a failure, which may mean that the master has another address."""
         if self.search is not None and lost:
             self.search.unanswered(self._time.now_ns())
             if self.search.lost:
                 self._enter("searching", str(error))
 
     def _enter(self, phase: Phase, reason: str) -> None:
-        """Be in this phase from now on, and say so if it is another one."""
+        """Enter a phase, and log it if it is a new one."""
         if phase != self.phase:
             before = f"{self.phase} → " if self.phase else ""
             logger.info("%s%s: %s", before, phase, reason)
@@ -316,11 +317,11 @@ class Uplink:
     async def _register(self) -> None:
         if self.search is None or not self.search.lost:
             self._enter(
-                "registering", f"at {self._client.url}{f', {self._told.found_by}' if self._told.found_by else ''}"
+                "registering", f"at {self._client.url}{f', {self._logged.found_by}' if self._logged.found_by else ''}"
             )
-        while self._presented is None:
+        while self._registering_camera is None:
             await self._outbox.woken(heartbeat=False)
-        camera, known_pose = self._presented
+        camera, known_pose = self._registering_camera
         await self._client.authorize()
         told, origin = known_pose or (None, "configured")
         software, boot_id = self._program
@@ -359,52 +360,52 @@ class Uplink:
         self._assign(assignment, f"registered at {self._client.url} as unit {answer.id}, ")
 
     def _begin_session(self, slot: InitializeAnswer | SlotAnswer, sent_at_ns: int) -> None:
-        """Registered at `sent_at_ns`: what was before is void."""
+        """Begin the session of a registration that was sent at `sent_at_ns`; the one before is void."""
         self._session = Session.begun(slot, sent_at_ns, self._time.now_ns())
         self.joints.clear()
         self._ledger.clear()
 
     def _refuse(self, slot: InitializeAnswer | SlotAnswer, error: CellwatchError) -> None:
-        """Do not follow a newer master that is not understood: what is unknown may have to be left unfiltered."""
+        """Do not work for a newer master that is not understood: a name that is not known may forbid the filter."""
         theirs, ours = f"{CONTRACT_VERSION}.{slot.contract_minor}", f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
         trouble = Trouble("contract", f"update this unit: it speaks contract {ours}, its master {theirs}: {error}")
-        # As long as the trouble is the same one, registering again did not help.
-        known = trouble.sentence == self._told.refused
-        retry_s = min(2.0 * self._told.contract_retry_s, CONTRACT_RETRY_MAX_S) if known else CONTRACT_RETRY_MIN_S
-        self._told.contract_retry_s = retry_s
+        # With the same trouble as before, registering again did not help.
+        known = trouble.sentence == self._logged.refused
+        retry_s = min(2.0 * self._logged.contract_retry_s, CONTRACT_RETRY_MAX_S) if known else CONTRACT_RETRY_MIN_S
+        self._logged.contract_retry_s = retry_s
         retry_at_ns = self._time.now_ns() + round(retry_s * NS_PER_S)
-        self._unclear = _Unclear(slot.session, slot.versions, trouble, retry_at_ns)
+        self._not_understood = _NotUnderstood(slot.session, slot.versions, trouble, retry_at_ns)
         level = logging.DEBUG if known else logging.WARNING
         logger.log(level, "%s", trouble.sentence)
-        self._told.refused = trouble.sentence
+        self._logged.refused = trouble.sentence
 
-    async def _tell_unclear(self, unclear: _Unclear) -> None:
-        """Tell why nothing is reported; register again when the master says something else, or now and then."""
+    async def _report_not_understood(self, refused: _NotUnderstood) -> None:
+        """Report why nothing is reported; register again when the master's versions change, and from time to time."""
         self._outbox.drop()
-        # The first one goes at once: until it arrives, the master knows only that this unit registered.
-        if unclear.reported:
+        # The first one is sent at once: until it arrives, the master knows only that this unit registered.
+        if refused.reported:
             await self._outbox.woken()
             self._outbox.drop()
         sent_at_ns = self._time.now_ns()
-        if sent_at_ns > unclear.retry_at_ns:
+        if sent_at_ns > refused.retry_at_ns:
             self._start_over()
             return
         answer = await self._client.update(
             UpdateRequest(
                 id=self._session.id,
-                session=unclear.session,
+                session=refused.session,
                 sequence=self._session.next_sequence(),
                 sent_at_ns=sent_at_ns,
                 exchange=self._session.exchange,
-                # Not that it works with these, but that it knows of them: so it is not told of them again.
-                versions=unclear.versions,
-                health=Health().model_copy(update=unclear.trouble.facts()),
+                # This unit does not work with these versions; it names them so that they are not sent again.
+                versions=refused.versions,
+                health=Health().model_copy(update=refused.trouble.facts()),
                 phase="fetching",
             )
         )
         self._session.note(sent_at_ns, answer, self._time.now_ns())
-        self._unclear = replace(unclear, reported=True)
-        if answer.versions != unclear.versions:
+        self._not_understood = replace(refused, reported=True)
+        if answer.versions != refused.versions:
             self._start_over()
 
     async def _get_cell(self, reference: CellReference) -> Cell:
@@ -414,13 +415,13 @@ class Uplink:
         return cell
 
     async def _report(self, assignment: Assignment) -> None:
-        """Send the latest report, or, when none comes, the one before again."""
+        """Send the latest report; without a new one send the last one again."""
         if self._outbox.empty:
             await self._outbox.woken()
         fresh = self._outbox.take()
         report = fresh or self._outbox.last or Report(assignment)
         if report.assignment.session != assignment.session:
-            # Made for a session that is over, in which the same versions may have meant something else.
+            # Made for an earlier session, in which the same version numbers may have had another meaning.
             if fresh is not None:
                 self._outbox.sent(fresh, None)
             report = Report(assignment)
@@ -442,7 +443,7 @@ class Uplink:
         seen = None
         if report.seen is not None and session.acknowledged != (versions, seen_bits):
             seen = seen_report(report.seen)
-            # Until the master has answered nobody knows which of the two it holds.
+            # Until the master has answered, either of the two may be the one that it holds.
             session.acknowledged = None
         done = self._ledger.ended()
         health = report.health.model_copy(update=self.camera_state.facts())
@@ -473,7 +474,7 @@ class Uplink:
         return answer, Delivery(sent_at_ns, answer.received_at_ns - offset_ns, answer.answered_at_ns - offset_ns)
 
     async def _follow(self, assignment: Assignment, answer: UpdateAnswer) -> None:
-        """Do what the master's answer asks for."""
+        """Apply the master's answer."""
         self._ledger.accept(answer.commands)
         if answer.versions == assignment.versions:
             return
@@ -488,7 +489,7 @@ class Uplink:
             pose = answer.T_world_camera
             changed = replace(changed, T_world_camera=None if pose is None else validated(pose, "T_world_camera"))
         if self.assignment is assignment:
-            # Otherwise the camera was changed meanwhile, and this session is over.
+            # Otherwise the camera changed meanwhile, and this session has ended.
             self._assign(changed)
 
     def _assign(self, assignment: Assignment, how: str = "") -> None:
@@ -498,13 +499,13 @@ class Uplink:
 
     def _start_over(self) -> None:
         self._latest.clear()
-        self._unclear = None
+        self._not_understood = None
 
     async def _wait(self, retry_s: float, error: CellwatchError) -> float:
-        """Wait before the next attempt; returns how long to wait after that."""
-        # Once each: a master that is gone, and then one with another certificate.
-        new = retry_s == RETRY_MIN_S or str(error) != self._told.complaint
-        self._told.complaint = str(error)
+        """Wait before the next attempt; returns the pause after that."""
+        # One line for each complaint: first a master that is gone, then one with another certificate.
+        new = retry_s == RETRY_MIN_S or str(error) != self._logged.complaint
+        self._logged.complaint = str(error)
         level = logging.WARNING if new or isinstance(error, ConfigError) else logging.DEBUG
         logger.log(level, "%s", error)
         await sleep(retry_s * random.uniform(0.8, 1.2), self._time)

@@ -344,7 +344,7 @@ async def test_a_unit_that_does_not_understand_its_master_says_so_until_it_does(
         assert row.cause is not None
         assert "update this unit" in row.reason
         assert "newer" in row.reason
-        assert "update this unit" in uplink.standing
+        assert "update this unit" in uplink.status_text
         assert uplink.assignment is None
         # What it did not understand is taken back.
         transport.newer.clear()

@@ -17,5 +17,5 @@ async def test_each_command_has_its_time_and_none_is_lost() -> None:
     batch = CommandBatch.take(queue)
     assert batch == CommandBatch([calibrate], [refine, drop], [image])
     assert queue.empty()
-    put_back(queue, (*batch.changes, *batch.pictures))
+    put_back(queue, (*batch.changes, *batch.images))
     assert CommandBatch.take(queue) == CommandBatch([], [refine, drop], [image])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a unit turns to: masters that listen on loopback, announcements and a clock that a test makes up."""
+"""The search for a master: masters that listen on loopback, made-up announcements, and a set clock."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ from tests.set_clock import START_NS, S, SetClock
 LOST_NS = round(LOST_S * S)
 
 PATIENCE_S = 20.0
-"""For a connection on loopback, on a busy machine; by the real clock, and so never measured."""
+"""Timeout of a connection on loopback, by the real clock; it is not measured."""
 
 
 class FakeBrowser:
-    """Hears what a test says."""
+    """A listener that receives the announcements of a test."""
 
     heard: tuple[Offer, ...] = ()
     closed: asyncio.Event
@@ -67,7 +67,7 @@ def clock() -> SetClock:
 def made_up(monkeypatch: pytest.MonkeyPatch, clock: SetClock) -> None:
     monkeypatch.setattr(FakeBrowser, "closed", clock.added, raising=False)
     monkeypatch.setattr(module, "Browser", FakeBrowser)
-    # A busy machine may be slow to connect to itself; nobody here listens without answering.
+    # A busy machine may be slow to connect to itself; every server here answers.
     monkeypatch.setattr(module, "REACH_S", PATIENCE_S)
     monkeypatch.setattr(FakeBrowser, "heard", ())
 
@@ -78,7 +78,7 @@ def config(folder: Path, **fields: Any) -> UnitConfig:
 
 @asynccontextmanager
 async def listening() -> AsyncIterator[int]:
-    """The port of somebody who takes connections."""
+    """The port of a server that accepts connections."""
     server = await asyncio.start_server(lambda reader, writer: writer.close(), "127.0.0.1", 0)
     async with server:
         yield server.sockets[0].getsockname()[1]
@@ -100,7 +100,7 @@ def offer(port: int, cell: str = "demo") -> Offer:
 
 
 async def pass_time(search: MasterSearch, clock: SetClock, seconds: float) -> None:
-    """Let so much time pass, look by look; the time at which a place is taken is the end of it."""
+    """Advance the clock from search to search, until so much time has passed or an address is used."""
     end_ns = clock.now + round(seconds * S)
 
     async def rests() -> None:
@@ -119,7 +119,7 @@ async def pass_time(search: MasterSearch, clock: SetClock, seconds: float) -> No
 
 
 def lose(search: MasterSearch, clock: SetClock) -> None:
-    """Have the master not answer for so long that it is lost."""
+    """Let the master not answer until it is lost."""
     search.unanswered(clock.now)
     clock.go_to(clock.now + LOST_NS - 1)
     search.unanswered(clock.now)
@@ -139,14 +139,14 @@ async def test_an_announced_master_is_taken_by_a_unit_that_knows_none(
         monkeypatch.setattr(FakeBrowser, "heard", (offer(port),))
         await pass_time(search, clock, 60.0)
         assert not search.lost
-        # From the look at which nobody was heard yet; all who are there have answered since.
+        # Since the search without any announcement; every master has answered since.
         assert HEAR_FIRST_S <= (clock.now - heard_ns) / S <= HEAR_FIRST_S + LOOK_S
         place = await search.place()
         assert place == Place(f"http://127.0.0.1:{port}", f"announced as 'demo at {port}'")
         await search.keep(place.url, "demo")
     kept = await asyncio.to_thread(load_kept, tmp_path / FILE_NAME)
     assert kept == Kept(place.url, "demo", place.found_by)
-    # After a restart it goes there at once.
+    # After a restart this address is used at once.
     search = await asyncio.to_thread(MasterSearch, config(tmp_path))
     assert await search.place() == Place(place.url, "as before")
 
@@ -177,7 +177,7 @@ async def test_what_was_tried_in_vain_is_not_tried_again_at_once(
         await pass_time(search, clock, 60.0)
         taken, taken_ns = await search.place(), clock.now
         assert taken.url == f"http://127.0.0.1:{second}"
-        # The other one, which never answered, waits for its time, and so it stays.
+        # The other one never answered and is paused, so the address stays.
         lose(search, clock)
         again_ns = taken_ns + round(VAIN_S * S)
         await pass_time(search, clock, (again_ns - 1 - clock.now) / S)

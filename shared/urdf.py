@@ -313,12 +313,12 @@ class _Shapes:
     def warnings(self) -> tuple[str, ...]:
         """Sentences about what the filter will not do as the file's author may expect."""
         unused = sorted(set(self.packages) - self.packages_used)
-        told = (
+        found = (
             (self.visual_only, "links without a collision shape, whose visual shape is filtered instead: {}"),
             (self.empty, "shapes without a size, which are passed over: {}"),
             (unused, "names under packages that no mesh of the file uses: {}"),
         )
-        return tuple(sentence.format(_listed(names)) for names, sentence in told if names)
+        return tuple(sentence.format(_listed(names)) for names, sentence in found if names)
 
     def _parts(self, name: str, link: minidom.Element) -> list[TriangleMesh]:
         """The meshes of a link, link frame."""

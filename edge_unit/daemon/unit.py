@@ -110,11 +110,11 @@ class Unit:
 
     def _frame_work(self) -> FrameProcessor:
         config, finish = self._config, self.uplink.finish
-        stance = PoseMonitor(config.state_dir)
+        monitor = PoseMonitor(config.state_dir)
         learning = BackgroundLearning(BackgroundStore(config.state_dir), config.learn_background_frames, finish)
-        assigned = AssignedPipeline(learning, stance)
-        refining = RefinementTask(self.uplink, assigned, stance)
-        return FrameProcessor(finish, assigned, learning, refining, stance, FrameJoints(self.uplink))
+        assigned = AssignedPipeline(learning, monitor)
+        refining = RefinementTask(self.uplink, assigned, monitor)
+        return FrameProcessor(finish, assigned, learning, refining, monitor, FrameJoints(self.uplink))
 
     async def run(self) -> None:
         """Run the unit.

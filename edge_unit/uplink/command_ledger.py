@@ -48,9 +48,9 @@ class CommandLedger:
             if ended.id in self._open:
                 self._ended.append(ended)
 
-    def forget(self, told: Iterable[Ended]) -> None:
+    def forget(self, received: Iterable[Ended]) -> None:
         """Remove the outcomes that the master has received."""
-        for ended in told:
+        for ended in received:
             self._ended.remove(ended)
             self._open.pop(ended.id, None)
 

@@ -323,7 +323,7 @@ class Uplink:
             await self._outbox.woken(heartbeat=False)
         camera, known_pose = self._registering_camera
         await self._client.authorize()
-        told, origin = known_pose or (None, "configured")
+        pose, origin = known_pose or (None, "configured")
         software, boot_id = self._program
         sent_at_ns = self._time.now_ns()
         request = InitializeRequest(
@@ -334,7 +334,7 @@ class Uplink:
             intrinsics=camera.intrinsics,
             software=software,
             boot_id=boot_id,
-            T_world_camera=None if told is None else matrix_of(told),
+            T_world_camera=None if pose is None else matrix_of(pose),
             pose_origin=origin,
             sent_at_ns=sent_at_ns,
         )

@@ -287,10 +287,10 @@ async def _cameras(source: RealsenseSourceConfig) -> AsyncIterator[Finding]:
                 "warning", "firmware", f"{firmware}, {recommended} is recommended: update it with realsense-viewer"
             )
         else:
-            yield Finding("ok", "firmware", firmware or "not told")
+            yield Finding("ok", "firmware", firmware or "not known")
         slow = device["usb"].startswith(("1", "2"))
         advice = ": few profiles and low rates; use a USB 3 port and its cable" if slow else ""
-        yield Finding("warning" if slow else "ok", "usb", f"USB {device['usb'] or 'version not told'}{advice}")
+        yield Finding("warning" if slow else "ok", "usb", f"USB {device['usb'] or 'version not known'}{advice}")
     serials = [device["serial"] for device in found.devices]
     if source.serial is not None and source.serial not in serials:
         there = ", ".join(serials) or "none"

@@ -40,7 +40,9 @@ def main() -> None:
         while (t_s := time.monotonic() - start_s) < chosen.seconds:
             positions, velocities = joints_at(t_s)
             answer = master.put("/robot/joints", json={"positions": positions, "velocities": velocities})
-            answer.raise_for_status()
+            if answer.is_error:
+                # The master's sentence names the field and the remedy.
+                raise SystemExit(f"{chosen.url}: {answer.status_code}: {answer.json()['detail']}")
             sent += 1
             time.sleep(max(0.0, start_s + sent * PERIOD_S - time.monotonic()))
         fresh = master.get("/robot").raise_for_status().json()

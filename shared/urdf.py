@@ -286,6 +286,7 @@ class _Shapes:
     packages: Mapping[str, Path]
     replaced: Mapping[str, TriangleMesh]
     visual_only: list[str] = field(default_factory=list)
+    unfiltered: list[str] = field(default_factory=list)
     empty: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     packages_used: set[str] = field(default_factory=set)
@@ -313,12 +314,13 @@ class _Shapes:
     def warnings(self) -> tuple[str, ...]:
         """Sentences about what the filter will not do as the file's author may expect."""
         unused = sorted(set(self.packages) - self.packages_used)
-        told = (
+        found = (
             (self.visual_only, "links without a collision shape, whose visual shape is filtered instead: {}"),
+            (self.unfiltered, "links without a collision shape, which are reported as obstacles: {}"),
             (self.empty, "shapes without a size, which are passed over: {}"),
             (unused, "names under packages that no mesh of the file uses: {}"),
         )
-        return tuple(sentence.format(_listed(names)) for names, sentence in told if names)
+        return tuple(sentence.format(_listed(names)) for names, sentence in found if names)
 
     def _parts(self, name: str, link: minidom.Element) -> list[TriangleMesh]:
         """The meshes of a link, link frame."""
@@ -330,6 +332,8 @@ class _Shapes:
             chosen = visuals
             if parts := self._meshes(name, visuals):
                 self.visual_only.append(name)
+        if not parts and visuals and not collisions and self.kind == "collision":
+            self.unfiltered.append(name)
         # Of no size, nothing can be filtered; without a word of its shape, nobody knows what is not.
         if not parts and any(_is_empty(element) for element in chosen):
             raise KinematicsError(

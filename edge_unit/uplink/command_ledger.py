@@ -47,9 +47,9 @@ class CommandLedger:
             if ended.id in self._open:
                 self._ended.append(ended)
 
-    def forget(self, reported: Iterable[Ended]) -> None:
+    def forget(self, received: Iterable[Ended]) -> None:
         """Forget the outcomes that the master has received."""
-        for ended in reported:
+        for ended in received:
             self._ended.remove(ended)
             self._open.pop(ended.id, None)
 

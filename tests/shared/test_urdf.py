@@ -267,7 +267,8 @@ def test_a_link_without_collision_is_filtered_by_its_visual_and_named(
     assert "tool0" not in warning
     assert warning in caplog.text
     assert list(read_urdf(file, "collision").meshes) == ["a"]
-    assert read_urdf(file, "collision").warnings == ()
+    (warning,) = read_urdf(file, "collision").warnings
+    assert warning == "links without a collision shape, which are reported as obstacles: guide"
 
 
 def test_a_shape_of_no_size_is_passed_over_with_a_word(tmp_path: Path) -> None:

@@ -70,14 +70,14 @@ class Capture:
 
     def _wait_for_device(self) -> Any:
         """Return the device, or None if it is no longer needed."""
-        told = ""
+        logged = ""
         while not self._stop.is_set():
             device, reason = self._devices.find()
             if device is not None:
                 return device
-            if reason != told:
+            if reason != logged:
                 self._send(link.Phase("waiting", reason))
-                told = reason
+                logged = reason
             self._alive()
             self._devices.wait()
         return None

@@ -26,8 +26,8 @@ from edge_unit.sources.realsense.source import RealsenseSource, RealsenseSourceC
 from edge_unit.tls import tls_context
 from edge_unit.uplink.cell_cache import mesh_hashes
 from edge_unit.uplink.client import MasterClient
-from edge_unit.uplink.master_discovery import judged, kept_of, reach, wanted_of
-from edge_unit.uplink.master_selection import Place, choose, first_place
+from edge_unit.uplink.master_discovery import check_offers, criteria_of, last_master_of, reach
+from edge_unit.uplink.master_selection import MasterAddress, choose, initial_address
 from geometry.compilation.cache import PRIVATE, settle
 from shared.cell import Cell
 from shared.clock import NS_PER_MS, NS_PER_S, monotonic_ns, wall_ns
@@ -104,14 +104,14 @@ async def examine(config: UnitConfig, seconds: float = MEASURE_S) -> AsyncIterat
     yield await asyncio.to_thread(software)
     yield clock()
     cell: Cell | None = None
-    place: Place | None = None
+    address: MasterAddress | None = None
     async for heard in _network(config):
-        if isinstance(heard, Place):
-            place = heard
+        if isinstance(heard, MasterAddress):
+            address = heard
         else:
             yield heard
-    if place is not None:
-        async for found in _master(config, place):
+    if address is not None:
+        async for found in _master(config, address):
             if isinstance(found, Cell):
                 cell = found
             else:
@@ -182,37 +182,37 @@ def stream(info: CameraInfo, measured: Measured, wanted_fps: float | None) -> It
         )
 
 
-async def _network(config: UnitConfig) -> AsyncIterator[Finding | Place]:
+async def _network(config: UnitConfig) -> AsyncIterator[Finding | MasterAddress]:
     """List the announced masters, the objection to each, and the unit's choice."""
     try:
         tls = await asyncio.to_thread(config.tls) or tls_context()
     except ConfigError as error:
         yield Finding("FAIL", "master", f"{error}; correct the configuration")
         return
-    wanted, kept = wanted_of(config), await asyncio.to_thread(kept_of, config)
+    criteria, last_master = criteria_of(config), await asyncio.to_thread(last_master_of, config)
     async with Browser() as browser:
         await asyncio.sleep(LISTEN_S)
-        candidates = await judged(await browser.offers(), wanted, kept, tls, config.source_address)
+        candidates = await check_offers(await browser.offers(), criteria, last_master, tls, config.source_address)
     for candidate in candidates:
         yield Finding("ok", "network", f"there is {candidate}")
     chosen, words = choose(candidates)
-    place = first_place(wanted, kept)
+    address = initial_address(criteria, last_master)
     if chosen is not None and chosen.url is not None:
-        if place is None or (place.url != chosen.url and await reach(place.url, tls, config.source_address)):
-            place = Place(chosen.url, words)
+        if address is None or (address.url != chosen.url and await reach(address.url, tls, config.source_address)):
+            address = MasterAddress(chosen.url, words)
     elif not candidates:
-        yield Finding("ok" if place is not None else "warning", "network", words)
-    if place is not None:
-        yield place
+        yield Finding("ok" if address is not None else "warning", "network", words)
+    if address is not None:
+        yield address
     else:
         yield Finding("FAIL", "master", f"{words}; start it on this network, or set master_url")
 
 
-async def _master(config: UnitConfig, place: Place) -> AsyncIterator[Finding | Cell]:
+async def _master(config: UnitConfig, address: MasterAddress) -> AsyncIterator[Finding | Cell]:
     """Check that the master answers and accepts the token; returns its cell, if it gives it."""
     try:
         tls = await asyncio.to_thread(config.tls)
-        client = MasterClient(place.url, config.read_token, config.source_address, tls=tls)
+        client = MasterClient(address.url, config.read_token, config.source_address, tls=tls)
     except ConfigError as error:
         yield Finding("FAIL", "master", f"{error}; correct the configuration")
         return
@@ -235,12 +235,12 @@ async def _master(config: UnitConfig, place: Place) -> AsyncIterator[Finding | C
             yield Finding("FAIL", "master", f"{error}; is it running, and is master_url right?")
             return
         if trip_ms <= ROUND_TRIP_OK_MS:
-            yield Finding("ok", "master", f"{client.url} ({place.found_by}) answers within {trip_ms:.1f} ms")
+            yield Finding("ok", "master", f"{client.url} ({address.found_by}) answers within {trip_ms:.1f} ms")
         else:
             yield Finding(
                 "warning",
                 "master",
-                f"{client.url} ({place.found_by}) takes {trip_ms:.0f} ms to answer; use a cable, not a radio network",
+                f"{client.url} ({address.found_by}) takes {trip_ms:.0f} ms to answer; use a cable, not a radio network",
             )
         yield await _token(client)
         try:

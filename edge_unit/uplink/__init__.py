@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The unit's side of the exchange with the master.
+"""The unit's connection to its master: discovery, registration and reports.
 
-A program that only calls a master needs no pipeline, so this page re-exports nothing. In the order of the flow:
+The package re-exports nothing, because a program that only sends requests to a master needs no pipeline. In the order
+of the flow:
 
-    master_selection  the choice among the masters that were discovered
-    master_discovery  the search for a master that does not answer
-    client            the calls of a unit to the master
+    master_selection  the choice of the unit's master among the announced ones
+    master_discovery  the search for the master while it does not answer
+    client            one method for each request to the master
     cell_cache        the master's cell, kept on disk
     assignment        the master's assignment and the unit's reports, as values
     outbox            the report that is sent next: latest-only
-    command_ledger    the master's commands, and what became of them
-    session           what holds from one registration to the next
+    command_ledger    the master's commands and their outcomes
+    session           the state between two registrations
     uplink            the exchange with the master, latest-only
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The master's assignment of a unit, and the unit's report of a frame, as values."""
+"""The master's assignment to a unit, and the unit's report of a frame, as values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shared.wire import pack_seen
 
 @dataclass(frozen=True, eq=False)
 class Assignment:
-    """The master's assignment of this unit: all that a frame is processed with."""
+    """The master's assignment to this unit: all inputs of frame processing that the master sets."""
 
     session: int
     versions: Versions
@@ -29,45 +29,46 @@ class Assignment:
 
     @property
     def phase(self) -> Phase:
-        """Phase of a unit with this assignment."""
+        """Return the phase of a unit with this assignment."""
         return "localising" if self.T_world_camera is None else "live"
 
 
 class LatestAssignment:
-    """The only owner of the assignment: the master's latest, None while the unit is not registered."""
+    """The only owner of the assignment: the master's latest one, or None while the unit is not registered."""
 
     def __init__(self) -> None:
         self.value: Assignment | None = None
-        self.there = asyncio.Event()
+        self.available = asyncio.Event()
 
     def set(self, assignment: Assignment) -> None:
         """Use `assignment` from the next frame on."""
         self.value = assignment
-        self.there.set()
+        self.available.set()
 
     def clear(self) -> None:
         """Remove the assignment until the unit has registered again."""
         self.value = None
-        self.there.clear()
+        self.available.clear()
 
 
 class Trouble(NamedTuple):
-    """The reason why a unit reports no voxels: a code, a sentence, and the progress of the task that ends it."""
+    """The reason why a unit reports no voxels: a code, a sentence, and the progress of a task that removes it."""
 
     code: TroubleCode
     sentence: str
     progress: Progress | None = None
 
     def facts(self) -> dict[str, Any]:
-        """Return the fields of `Health` for this trouble; a sentence that is too long is cut."""
+        """Return the trouble as fields of `Health`. A sentence longer than `MAX_TEXT` is cut."""
         return {"trouble": self.sentence[:MAX_TEXT], "trouble_code": self.code, "progress": self.progress}
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """The result of one frame, with the assignment that it was made with. `seen` is None if nothing is known of it.
+    """The result of one frame, and the assignment that the frame was processed with.
 
-    `stages_ns` has the duration of each stage, for a frame that went through all of them.
+    `seen` is None when the unit does not know which space it has seen. `stages_ns` has the duration of each stage if
+    the frame passed all stages.
     """
 
     assignment: Assignment
@@ -79,7 +80,7 @@ class Report:
 
 
 class Delivery(NamedTuple):
-    """Times at which a report was sent, received and merged, by the unit's clock, ns."""
+    """The times of a report, in ns of the unit's clock: sent, received whole by the master, merged by the master."""
 
     sent_at_ns: int
     received_at_ns: int
@@ -87,7 +88,7 @@ class Delivery(NamedTuple):
 
 
 def seen_report(seen: SeenBlocks) -> SeenReport:
-    """Return the blocks as a report; with larger blocks if it would be too long."""
+    """Return the blocks as a report, in larger blocks if the report would be too long."""
     while True:
         nx, ny, nz = seen.lattice.shape
         report = pack_seen(seen.seen.reshape(nx, ny, nz), seen.lattice.voxel_size_m)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The master's cell, kept on disk so that a restarted unit need not fetch it again."""
+"""The master's cell, kept on disk so that a restarted unit does not have to fetch it again."""
 
 from __future__ import annotations
 
@@ -18,23 +18,25 @@ from shared.messages import CellReference
 logger = logging.getLogger(__name__)
 
 MAX_MESHES = 1000
-"""Limit of meshes of one cell: more than the bodies and links that a cell may have."""
+"""Maximum number of meshes of one cell: more than the bodies and links that a cell may have."""
 
 
 class CellCache:
-    """A folder with the document of the last cell, and its meshes by their hashes."""
+    """A folder with the document of the last cell, and with its meshes by their hashes."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._last: Cell | None = None
 
     async def get(self, reference: CellReference, client: MasterClient) -> Cell:
-        """Return the master's cell, read from disk as far as possible; the same object while it does not change.
+        """Return the cell that the master watches. Parts that are on disk are not fetched.
+
+        As long as the cell does not change, each call returns the same object.
 
         Raises:
-            UplinkError: the master does not send it.
-            WireError: the master sends another cell.
-            CellError: the document is not a cell.
+            UplinkError: the master does not send the cell.
+            WireError: the answer is not the cell of `reference`.
+            CellError: the answer is not a valid cell.
         """
         if self._last is not None and self._last.version == reference.sha256:
             return self._last
@@ -59,7 +61,7 @@ class CellCache:
                     f"cell {reference.name}: expected version {reference.sha256[:8]}, got {cell.version[:8]}"
                 )
         except CellwatchError:
-            # The master's cell changed since its answer, or a file is damaged: fetch everything again.
+            # The master's cell changed between two answers, or a file on disk is damaged. Fetch all files again.
             await asyncio.to_thread(self._keep_only, set())
             raise
         if fetched:
@@ -85,14 +87,15 @@ class CellCache:
         self._keep_only({f"{sha256}.json", *(f"{mesh}.mesh" for mesh in meshes)})
 
     def _write(self, name: str, data: bytes) -> None:
-        """Write a file whole or not at all; with a full disk the unit goes on without the cache."""
+        """Write the whole file or nothing. If the disk is full, the unit works on without this file."""
         path = self._folder / name
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            # A file that a power cut damaged is noticed by its hash and fetched again, so nothing waits for the disk.
+            # Not synced, so a start does not wait for the disk. The hash shows damage by a power cut, and the file is
+            # fetched again.
             write_whole(path, data, synced=False)
         except OSError as error:
-            logger.warning("%s: the cell cannot be kept: %s", path, error)
+            logger.warning("%s: the cell cannot be kept, and is fetched again after a restart: %s", path, error)
 
     def _keep_only(self, names: set[str]) -> None:
         try:
@@ -100,11 +103,15 @@ class CellCache:
                 if file.name not in names:
                     file.unlink(missing_ok=True)
         except OSError as error:
-            logger.warning("%s: old cells cannot be removed: %s", self._folder, error)
+            logger.warning("%s: files of old cells cannot be removed: %s", self._folder, error)
 
 
 def mesh_hashes(document: dict[str, Any]) -> list[str]:
-    """Return the hashes that a cell's document names anywhere under `mesh`: 64 hexadecimal digits each."""
+    """Return the hashes of all meshes in a cell's document, at any depth: 64 hexadecimal digits under `mesh`.
+
+    Raises:
+        CellwatchError: there are more than `MAX_MESHES`.
+    """
     found: set[str] = set()
     pending: list[Any] = [document]
     while pending:

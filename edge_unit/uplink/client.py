@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calls of a unit to the master, one request each; HTTP errors become errors of the project here."""
+"""The client of the master: each method sends one request. HTTP errors are raised as errors of this project."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ from shared.transforms import Transform
 from shared.wire import MAX_ANSWER_BYTES, MEDIA_TYPE, decode, decode_update_answer, encode, encode_update, unpack
 
 TIMEOUT = httpx.Timeout(2.0, connect=0.5)
-"""Timeout of a call: after it the next frame is worth more than the answer to this one.
+"""Timeouts of a request. After 2 s the next frame is worth more than the answer to this one.
 
-A connection that is requested while the network is cut is not established when the network returns, because the kernel
-retries only after a second. So a new connection is requested before that."""
+A connection attempt that starts while the network is cut does not succeed as soon as the network is back, because the
+kernel retries only after a second. So the client gives up earlier and starts another attempt."""
 
 TRANSFER_TIMEOUT_S = 30.0
-"""Timeout for a mesh of MAX_MESH_BYTES over a slow network."""
+"""Timeout for a mesh of `MAX_MESH_BYTES` over a slow network."""
 
 MAX_MESH_BYTES = 128 * 2**20
-"""Limit of one mesh; a robot link has a hundredth of it."""
+"""Maximum size of one mesh. A robot link has a hundredth of it."""
 
 IMAGE_TIMEOUT_S = 5.0
-"""Timeout for an image; the client that requested it waits no longer."""
+"""Timeout for sending an image. A client that requested the image waits no longer either."""
 
 LIMITS = httpx.Limits(max_connections=4, max_keepalive_connections=4, keepalive_expiry=60.0)
-"""Limit of connections: an update, joints, the cell and a pose at the same time."""
+"""One connection each for update, joints, cell and pose, which can run at the same time."""
 
 MSGPACK_BOTH_WAYS = {"Content-Type": MEDIA_TYPE, "Accept": MEDIA_TYPE}
 
 ERROR_CHARS = 300
-"""Length limit of the master's reason."""
+"""Maximum length of the reason that is kept from a refusal."""
 
 
 class MasterClient:
@@ -66,34 +66,38 @@ class MasterClient:
         transport: httpx.AsyncBaseTransport | None = None,
         tls: ssl.SSLContext | None = None,
     ) -> None:
-        """Call `read_token` at each registration; connect from the own IP `source_address`.
+        """Read no token yet: `read_token` is called at each registration.
 
-        `transport` carries the requests in place of a network. `tls` checks the master's certificate; without it, a
-        certificate is checked against the CAs of the system. With `url` None there is no master until `aim` names one.
+        `source_address` is an IP address of this machine to connect from. `transport` carries the requests in place of
+        a network. `tls` checks the master's certificate; without it, the certificate of an https master is checked
+        against the CAs of the system. With `url` None there is no master until `set_url` names one.
+
+        Raises:
+            ConfigError: `url` is refused by `set_url`.
         """
         self._read_token = read_token
         self._tls = tls
         self.url = ""
-        """URL of the master; empty while there is none."""
+        """URL of the master, empty while none is known."""
         if transport is None:
-            # Also if this master has no TLS, because another one may have it.
+            # The TLS context is needed even with an http master: the next master may use https.
             transport = httpx.AsyncHTTPTransport(
                 verify=tls or tls_context(), local_address=source_address, limits=LIMITS
             )
         self._http = httpx.AsyncClient(
             transport=transport,
             timeout=TIMEOUT,
-            # No proxy from the environment: the master is on our own network.
+            # No proxy from the environment: the master is on the unit's own network.
             trust_env=False,
         )
         if url is not None:
-            self.aim(url)
-        # These headers would add a hundred bytes to every update, without use for the master.
+            self.set_url(url)
+        # The master uses none of these headers, and they cost a hundred bytes in each update.
         for name in ("Accept", "Accept-Encoding", "Connection", "User-Agent"):
             del self._http.headers[name]
 
-    def aim(self, url: str) -> None:
-        """Call the master at `url` from now on.
+    def set_url(self, url: str) -> None:
+        """Send all further requests to the master at `url`.
 
         Raises:
             ConfigError: `url` is not a URL, or not https although the master's certificate must be checked.
@@ -102,7 +106,9 @@ class MasterClient:
         if not parts.hostname:
             raise ConfigError(f"master_url: expected http://host:port, got {url}")
         if self._tls is not None and parts.scheme != "https":
-            raise ConfigError(f"master_url: expected https, since the master's certificate is to be checked, got {url}")
+            raise ConfigError(
+                f"master_url: expected https, because the master's certificate must be checked, got {url}"
+            )
         self.url = url.rstrip("/")
         self._http.base_url = httpx.URL(self.url)
 
@@ -125,16 +131,16 @@ class MasterClient:
         self._http.headers["Authorization"] = f"Bearer {token}"
 
     async def initialize(self, request: InitializeRequest) -> InitializeAnswer:
-        """Register for a slot.
+        """Register, and return the master's answer.
 
         Raises as `update`, and also:
-            MasterRefused: the master has an older contract than the unit.
-            NewerContract: the master has a newer contract, and its answer has a name that this unit does not know.
+            MasterRefused: the master speaks an older contract than the unit.
+            NewerContract: the master speaks a newer contract, and its answer has fields unknown to this unit.
         """
         try:
             data = await self._call("POST", "/initialize", encode(request))
         except MasterRefused as error:
-            # The only sign by which a master of contract 5.0 refuses a minor number.
+            # A master of contract 5.0 knows no minor number, and refuses the field.
             if error.status == 422 and error.detail.startswith("contract_minor:"):
                 raise self._older(0) from error
             raise
@@ -149,38 +155,38 @@ class MasterClient:
         return answer
 
     def _older(self, minor: int) -> MasterRefused:
-        """Return the refusal by a master of an older minor, which may not say so itself."""
+        """Return the error for a master of an older `minor`, whether it refused the registration itself or not."""
         ours = f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
         detail = f"contract: this master speaks version {CONTRACT_VERSION}.{minor}, this unit {ours}"
         return MasterRefused(f"{self.url}/initialize: {detail}; update the master first", 400, detail)
 
     async def update(self, update: UpdateRequest) -> UpdateAnswer:
-        """Report a frame.
+        """Report a frame, and return the answer.
 
         Raises:
-            MasterUnreachable: no answer came in time.
-            MasterRefused: the master refused; `status` is the HTTP status.
-            WireError: the answer is not one of the contract.
+            MasterUnreachable: the master did not answer in time.
+            MasterRefused: the master refused the request; `status` is the HTTP status.
+            WireError: the answer is not valid.
         """
         headers = {"Content-Type": MEDIA_TYPE}
         return decode_update_answer(await self._call("POST", "/update", encode_update(update), headers))
 
     async def robot(self, since_ns: int, timeout_s: float) -> RobotAnswer:
-        """Return the joints after `since_ns` by the master's clock. Raises as `update`."""
+        """Return the joints after `since_ns`, in ns of the master's clock. Raises as `update`."""
         data = await self._call("GET", f"/robot?since_ns={since_ns}", timeout=httpx.Timeout(timeout_s))
         return decode(RobotAnswer, data)
 
     async def put_pose(
         self, unit_id: int, T_world_camera: Transform, origin: str, quality: PoseQuality | None = None
     ) -> int:
-        """Send the camera's pose; returns the version of the pose. Raises as `update`."""
+        """Report the camera's pose, and return the version of the pose. Raises as `update`."""
         document = {"T_world_camera": T_world_camera.tolist(), "origin": origin, "quality": quality or PoseQuality()}
         request = PoseRequest.model_validate(document)
         data = await self._call("PUT", f"/units/{unit_id}/pose", encode(request))
         return decode(PoseAnswer, data).pose
 
     async def put_image(self, unit_id: int, kind: ImageKind, command_id: int, png: bytes) -> None:
-        """Send an image that a command requests. Raises as `update`."""
+        """Send an image that a command requested. Raises as `update`."""
         path = f"/units/{unit_id}/images/{kind}?command={command_id}"
         await self._call("PUT", path, png, {"Content-Type": "image/png"}, IMAGE_TIMEOUT_S)
 
@@ -222,6 +228,6 @@ class MasterClient:
 
 
 def _reason(body: bytearray) -> str:
-    """Return the sentence of a refusal, in either encoding."""
+    """Return the sentence of a refusal, from JSON or plain text."""
     text = bytes(body[:ERROR_CHARS]).decode("utf-8", "replace")
     return text.removeprefix('{"detail":"').removesuffix('"}')

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The master's commands: those that wait, those that are being carried out, and the outcomes of the others.
+"""The master's commands: waiting, being executed, and finished with an outcome.
 
-`finish` is the only way by which the worker thread passes anything to the event loop; everything else here belongs to
-the loop.
+Only `finish` may be called from the thread that processes frames. All other methods belong to the event loop.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ class CommandLedger:
     """The commands of one session.
 
     Attributes:
-        waiting: commands that were not taken yet.
+        waiting: the commands that are not taken yet.
     """
 
     def __init__(self) -> None:
@@ -28,18 +27,18 @@ class CommandLedger:
         self._ended: list[Ended] = []
 
     def accept(self, commands: Iterable[Command]) -> None:
-        """Add new commands; the master sends those again that find no room."""
+        """Queue the new ones of `commands`. The master sends a command again if the queue was full."""
         for command in commands:
             if command.id not in self._open and not self.waiting.full():
                 self._open[command.id] = command
                 self.waiting.put_nowait(command)
 
     def finish(self, command: Command, outcome: Outcome = DONE) -> None:
-        """Report the outcome of a command with the next update; may be called from any thread."""
+        """Report the outcome of `command` with the next update. May be called from any thread."""
         self._finished.put(Ended.of(command.id, outcome))
 
     def ended(self) -> tuple[Ended, ...]:
-        """Return the outcomes for the next update, at most MAX_COMMANDS."""
+        """Return the outcomes that the next update reports, at most `MAX_COMMANDS`."""
         while True:
             try:
                 ended = self._finished.get_nowait()
@@ -49,13 +48,13 @@ class CommandLedger:
                 self._ended.append(ended)
 
     def forget(self, received: Iterable[Ended]) -> None:
-        """Remove the outcomes that the master has received."""
+        """Forget the outcomes that the master has received."""
         for ended in received:
             self._ended.remove(ended)
             self._open.pop(ended.id, None)
 
     def clear(self) -> None:
-        """Remove the session's commands; the master sends those again that it still needs."""
+        """Forget the commands of the session. The master sends unfinished commands again."""
         self._open.clear()
         self.ended()
         self._ended.clear()

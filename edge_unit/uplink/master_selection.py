@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The choice among masters, by configuration, by the last master, and by announcements; without any network access.
+"""The choice of the unit's master. It uses the configuration, the last master and the announcements, and no network.
 
-    configured   master_url, always first
-    kept         the last master that answered
-    announced    the only master that watches this unit's cell and is checked as well as the one before
+    configured   `master_url`; always tried first
+    last master  the master that registered this unit last
+    announced    the only announced master that watches the unit's cell and is checked as strictly as the last one
 
-A unit registers at the master of an unknown cell only if it has no configured cell and never had another master.
+A unit accepts a master of any cell only if no cell is configured and it never had a master before.
 """
 
 from __future__ import annotations
@@ -20,16 +20,23 @@ from shared.messages import CONTRACT_MINOR, CONTRACT_VERSION
 
 
 @dataclass(frozen=True)
-class Place:
-    """URL of a master, and its origin."""
+class MasterAddress:
+    """The URL of a master, and the way in which it was found."""
 
     url: str
     found_by: str
 
 
 @dataclass(frozen=True)
-class Kept:
-    """The last master that registered this unit: its URL, its cell, its origin, and the master_url at that time."""
+class LastMaster:
+    """The last master that registered this unit.
+
+    Attributes:
+        url: its URL.
+        cell: the name of its cell.
+        found_by: the way in which it was found.
+        configured: `master_url` at that time.
+    """
 
     url: str
     cell: str
@@ -38,8 +45,8 @@ class Kept:
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """The configuration about the master. With `checked`, the master is verified by its certificate."""
+class MasterCriteria:
+    """The configuration's criteria for the master. With `checked`, its certificate must be valid."""
 
     url: str | None = None
     cell: str | None = None
@@ -49,7 +56,7 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A master that was announced; `url` is where it answered, `objection` the reason why it is not suitable."""
+    """An announced master: the `url` at which it was reached, or the `objection` to it."""
 
     offer: Offer
     url: str | None = None
@@ -61,67 +68,71 @@ class Candidate:
         return f"{self.offer.name!r} (cell {cell}, {where}){why}"
 
 
-def first_place(wanted: Wanted, kept: Kept | None) -> Place | None:
-    """Return the address to use before any announcement; None if there is none."""
-    if wanted.url is not None:
-        return Place(wanted.url, "configured")
-    return None if kept is None or distrusted(kept, wanted) else Place(kept.url, "as before")
+def initial_address(criteria: MasterCriteria, last_master: LastMaster | None) -> MasterAddress | None:
+    """Return the address to use before any announcement, or None if none is known."""
+    if criteria.url is not None:
+        return MasterAddress(criteria.url, "configured")
+    if last_master is None or is_ruled_out(last_master, criteria):
+        return None
+    return MasterAddress(last_master.url, "as before")
 
 
-def distrusted(kept: Kept, wanted: Wanted) -> bool:
-    """Return True if the configuration changed so that the last master is not suitable any more."""
-    if wanted.checked and not kept.url.startswith("https://"):
+def is_ruled_out(last_master: LastMaster, criteria: MasterCriteria) -> bool:
+    """Return True if the configuration has changed and no longer allows the last master."""
+    if criteria.checked and not last_master.url.startswith("https://"):
         return True
-    if wanted.url is not None and wanted.url != kept.configured:
+    if criteria.url is not None and criteria.url != last_master.configured:
         return True
-    return wanted.cell is not None and kept.cell != wanted.cell
+    return criteria.cell is not None and last_master.cell != criteria.cell
 
 
-def objection(offer: Offer, wanted: Wanted, kept: Kept | None) -> str | None:
-    """Return the reason why this master is not suitable, or None. An announcement can only speak against a master."""
+def objection(offer: Offer, criteria: MasterCriteria, last_master: LastMaster | None) -> str | None:
+    """Return the reason why this master does not fit, or None.
+
+    An announcement is not authenticated. It can only exclude a master, and never proves its identity.
+    """
     says = offer.says
     if says.contract != CONTRACT_VERSION or says.minor < CONTRACT_MINOR:
         older = "this unit" if says.contract > CONTRACT_VERSION else "the master"
         theirs, ours = f"{says.contract}.{says.minor}", f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
         return f"it speaks contract {theirs}, this unit {ours}; update {older} first"
-    if wanted.checked and not says.tls:
-        return "it does not speak TLS, and its certificate is to be checked"
-    if wanted.fingerprint is not None and says.fingerprint != wanted.fingerprint[:SHA_DIGITS]:
-        return "its certificate is not that of master_fingerprint"
-    if kept is not None and kept.url.startswith("https://") and not says.tls:
-        return "it does not speak TLS, as the master before did"
-    if wanted.cell is not None:
-        return None if says.cell == shortened(wanted.cell) else f"it does not watch cell {wanted.cell}"
-    if kept is not None:
-        return (
-            None if says.cell == shortened(kept.cell) else f"it does not watch cell {kept.cell}, as the master before"
-        )
-    return "master_url names another" if wanted.url is not None else None
+    if criteria.checked and not says.tls:
+        return "it does not speak TLS, but its certificate must be checked"
+    if criteria.fingerprint is not None and says.fingerprint != criteria.fingerprint[:SHA_DIGITS]:
+        return "its certificate does not match master_fingerprint"
+    if last_master is not None and last_master.url.startswith("https://") and not says.tls:
+        return "it does not speak TLS, but the last master did"
+    if criteria.cell is not None:
+        return None if says.cell == shortened(criteria.cell) else f"it does not watch cell {criteria.cell}"
+    if last_master is not None:
+        same = says.cell == shortened(last_master.cell)
+        return None if same else f"it does not watch cell {last_master.cell} of the last master"
+    return "master_url names another master" if criteria.url is not None else None
 
 
 def choose(candidates: Sequence[Candidate], cells: Collection[str] = ()) -> tuple[Candidate | None, str]:
-    """Return the only suitable master that answered, and the result of the search in words.
+    """Return the only suitable candidate that was reached, or None; and the result as a sentence.
 
-    `cells` are those whose masters were suitable until now: if there were several, the last one that is left is not
-    chosen either.
+    `cells` are the cells of all suitable masters until now. If there were several, the unit does not choose the last
+    remaining one, because it was not preferable to the others.
     """
     if not candidates:
         return None, "no master is announced on this network"
     fit = [candidate for candidate in candidates if candidate.objection is None and candidate.url is not None]
     if len(fit) == 1 and set(cells) - {fit[0].offer.says.cell}:
-        there = ", ".join(sorted({*cells, fit[0].offer.says.cell}))
-        return None, f"masters of several cells were here ({there}), choose one by cell or master_url: {fit[0]}"
+        names = ", ".join(sorted({*cells, fit[0].offer.says.cell}))
+        return None, f"masters of several cells were announced ({names}), choose one by cell or master_url: {fit[0]}"
     if len(fit) == 1:
         return fit[0], f"announced as {fit[0].offer.name!r}"
     if fit:
-        return None, f"{len(fit)} masters would do, choose one by cell or master_url: {'; '.join(map(str, fit))}"
-    return None, f"none of the announced masters will do: {'; '.join(map(str, candidates))}"
+        return None, f"{len(fit)} masters are suitable, choose one by cell or master_url: {'; '.join(map(str, fit))}"
+    return None, f"none of the announced masters is suitable: {'; '.join(map(str, candidates))}"
 
 
 def in_order(urls: Sequence[str], own: Sequence[IPv4Interface]) -> list[str]:
-    """Return a master's URLs, likeliest first: in an own network, then beyond, then at an address of this machine.
+    """Return a master's URLs, likeliest first: local networks, other networks, this machine's addresses.
 
-    Many machines may have the same private address, so it means this machine only if nothing else answers.
+    Many machines can have the same private address. So an address of this machine is tried last.
     """
 
     def rank(url: str) -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state from one registration at a master to the next."""
+"""The state of a session, from one registration at a master to the next."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from shared.timebase import ClockOffset, Exchange
 
 @dataclass(eq=False)
 class Session:
-    """One registration; before the first, `id` is 0.
+    """One registration. `id` is 0 before the first one.
 
     Attributes:
-        id: the unit's number at the master.
-        sequence: number of the last update.
-        master_minor: minor of the master's contract.
-        clock: offset of the master's clock from this unit's.
-        exchange: times of the last request and answer.
-        acknowledged: the seen report that the master is known to hold: its versions and packed bits.
+        id: the number that the master gave the unit.
+        sequence: the sequence number of the last update.
+        master_minor: the minor version of the master's contract.
+        clock: the estimated offset of the master's clock from the unit's clock.
+        exchange: the times of the last request and its answer.
+        acknowledged: versions and packed bits of the seen report that the master has confirmed.
     """
 
     id: int = 0
@@ -31,17 +31,17 @@ class Session:
 
     @classmethod
     def begun(cls, slot: InitializeAnswer | SlotAnswer, sent_at_ns: int, returned_at_ns: int) -> Session:
-        """Begin a session with the answer to a registration, sent at `sent_at_ns` and answered at `returned_at_ns`."""
+        """Return the session of a registration that was sent at `sent_at_ns`. Its answer came at `returned_at_ns`."""
         session = cls(id=slot.id, master_minor=slot.contract_minor)
         session.note(sent_at_ns, slot, returned_at_ns)
         return session
 
     def next_sequence(self) -> int:
-        """Return the number of the next update."""
+        """Return the sequence number of the next update."""
         self.sequence += 1
         return self.sequence
 
     def note(self, sent_at_ns: int, answer: InitializeAnswer | SlotAnswer | UpdateAnswer, returned_at_ns: int) -> None:
-        """Note the times of a request that was sent at `sent_at_ns` and answered at `returned_at_ns`."""
+        """Add the times of a request that was sent at `sent_at_ns`. Its answer came at `returned_at_ns`."""
         self.exchange = Exchange(sent_at_ns, answer.received_at_ns, answer.answered_at_ns, returned_at_ns)
         self.clock.add(self.exchange)

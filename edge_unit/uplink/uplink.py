@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exchange with the master: register, then report the latest frame, without end.
+"""The exchange with the master: register once, then report the latest frame until cancelled.
 
-Reports are latest-only: a newer one replaces one that was not sent yet, so that a slow network drops frames and adds
-no delay. After any failure the unit registers again, because the master may have been restarted or replaced.
+The outbox holds one report. A newer report replaces one that is not sent yet, so a slow network drops frames and adds
+no delay. After an error that ends the session the unit registers again, at a restarted master or at another one.
 
-Each phase has its own way of retrying, and each change of phase is one line in the log:
+The unit's progress is its phase. Each phase has its own retries, and each change of phase is one log line:
 
     searching ───► registering ───► fetching ───► localising ───► live
-     for a place    at that place    the cell      the camera,     every frame
+     for a master   at its address   the cell      the camera      each frame
      every 2 s,     every 50 to      that is not   by the board,   is filtered
-     and when       250 ms           on disk       for ever        and reported
-     one is heard       ▲            already           ▲              │
-     of                 ├────────────────┴─────────────┼──────────────┤ it does not know us any more
+     and at each    250 ms           on disk       without limit   and reported
+     announcement       ▲                ▲             ▲              │
+                        ├────────────────┴─────────────┼──────────────┤ the master does not know the unit
         ▲               │                              └──────────────┤ the pose is void
-        └───────────────┴─────────────────────────────────────────────┘ nobody answered for 2 s
+        └───────────────┴─────────────────────────────────────────────┘ no answer for 2 s
 """
 
 from __future__ import annotations
@@ -73,28 +73,29 @@ logger = logging.getLogger(__name__)
 
 RETRY_MIN_S = 0.05
 RETRY_MAX_S = 0.25
-"""Longest pause between retries: a master that returns has its units back within a second."""
+"""Pauses between attempts. A master that returns has its units back within a second, even if a connection attempt has
+just failed."""
 
 JOINTS_TIMEOUT_S = 0.02
-"""Timeout for joints newer than those of the last update; a frame waits no longer for them."""
+"""Timeout of a request for joints newer than those of the last update. A frame waits no longer for them."""
 
 NOT_OURS = frozenset({400, 401, 403, 404, 405, 426})
-"""Refusals by a server that is not this unit's master: another contract, another token, or no master at all."""
+"""Statuses of a refused registration: the host is no master, or a master of another contract or token."""
 
 CONTRACT_RETRY_MIN_S, CONTRACT_RETRY_MAX_S = 5.0, 300.0
-"""Pauses before this unit registers again at a newer master that it does not understand.
+"""Pauses before this unit registers again at a newer master that it does not understand and that reports no change.
 
-They double, because registering again seldom helps: an update of this unit restarts it, and a change at the master is
-reported with its answers.
+Each pause is twice the one before. Only two things help: an update of the unit, which restarts it, or a change at the
+master, which the master reports.
 """
 
 START_OVER = frozenset({401, 403, 404, 409})
-"""Answers after which the unit registers again: the master does not know its token, id, session or address any more."""
+"""Statuses after which the unit registers again: the master does not know its token, unit, session or address."""
 
 
 @dataclass(frozen=True)
 class _NotUnderstood:
-    """A session whose settings, cell or pose this unit does not understand completely."""
+    """A session with a newer master whose settings or cell this unit does not understand completely."""
 
     session: int
     versions: Versions
@@ -105,7 +106,7 @@ class _NotUnderstood:
 
 @dataclass
 class _Logged:
-    """The last log lines, so that they are not repeated with each attempt."""
+    """The last logged errors, so that a retry does not log them again; also the last pause and the master's origin."""
 
     complaint: str = ""
     refused: str = ""
@@ -115,26 +116,26 @@ class _Logged:
 
 @dataclass
 class CameraState:
-    """The camera's trouble and warning; they are part of each update, whatever the health of its frame."""
+    """The camera's trouble and warning. Each update has them, and they replace those of the report's frame."""
 
     trouble: Trouble | None = None
     warning: str | None = None
 
     def facts(self) -> dict[str, Any]:
-        """Return the fields of `Health`; empty without trouble and warning."""
+        """Return trouble and warning as fields of `Health`, or an empty dict if there are none."""
         facts = {} if self.trouble is None else self.trouble.facts()
         return facts if self.warning is None else facts | {"warning": self.warning}
 
 
 class _RegisteringCamera(NamedTuple):
-    """The camera to register with, and the pose to report: `T_world_camera` and its origin."""
+    """The camera to register with, and the pose to report to the master: `T_world_camera` and its origin."""
 
     camera: CameraInfo
     known_pose: tuple[Transform, ReportedOrigin] | None
 
 
 class Uplink:
-    """Registration and reports in the background; `run` never returns."""
+    """Registers and reports in the background; `run` never returns."""
 
     def __init__(
         self,
@@ -146,10 +147,10 @@ class Uplink:
         search: MasterSearch | None = None,
         clock: Clock = LOOP_CLOCK,
     ) -> None:
-        """Call `on_sent` with each report and its delivery; None if it did not reach the master.
+        """Set `on_sent`, which is called for each report with its delivery, or with None if the report was dropped.
 
-        `search` finds the master's address; without it the client's URL stays. `clock` is the unit's clock; timeouts of
-        requests are the client's own.
+        `search` finds the master's address. Without it the client keeps its URL. `clock` is the unit's clock; it does
+        not apply to the timeouts of the client's requests.
         """
         self._client = client
         self._time = clock
@@ -169,30 +170,30 @@ class Uplink:
 
     @property
     def assignment(self) -> Assignment | None:
-        """The master's assignment of this unit; None while the unit is not registered."""
+        """Return the master's assignment, or None while the unit is not registered."""
         return self._latest.value
 
     @property
     def assigned(self) -> asyncio.Event:
-        """Set while there is an assignment."""
-        return self._latest.there
+        """Return the event that is set while there is an assignment."""
+        return self._latest.available
 
     @property
     def commands(self) -> asyncio.Queue[Command]:
-        """The master's commands that were not taken yet."""
+        """Return the queue of the master's commands that are not taken yet."""
         return self._ledger.waiting
 
     @property
     def clock(self) -> ClockOffset:
-        """Offset of the master's clock from this unit's, in this session."""
+        """Return the offset of the master's clock from the unit's clock in this session."""
         return self._session.clock
 
-    # ------------------------------------------------------------------ called by the unit
+    # ------------------------------------------------------------------ calls of the unit
 
     def set_camera(self, camera: CameraInfo, known_pose: tuple[Transform, ReportedOrigin] | None) -> None:
-        """Set the camera to register with; with another camera the unit registers again.
+        """Set the camera to register with. If it differs from the one before, register again.
 
-        `known_pose` (`T_world_camera` and its origin) is reported to the master, which may have a better one.
+        `known_pose` (`T_world_camera` and its origin) is reported to the master, which can answer with another pose.
         """
         before = None if self._registering_camera is None else self._registering_camera.camera
         if before is not None and (before.serial, before.intrinsics) != (camera.serial, camera.intrinsics):
@@ -201,24 +202,24 @@ class Uplink:
         self._outbox.wake()
 
     def offer(self, report: Report) -> None:
-        """Send this report next; an earlier one that was not sent yet is dropped."""
+        """Send `report` next. An earlier report that is not sent yet is dropped."""
         self._outbox.offer(report)
 
     def finish(self, command: Command, outcome: Outcome = DONE) -> None:
-        """Report the outcome of a command with the next update; may be called from any thread."""
+        """Report the outcome of `command` with the next update. May be called from any thread."""
         self._ledger.finish(command, outcome)
 
     async def send_image(self, command: Command, png: bytes) -> None:
-        """Send the image that a command requests. Raises as `MasterClient.update`."""
+        """Send the image that `command` requested. Raises as `MasterClient.update`."""
         assert command.image is not None
         await self._client.put_image(self._session.id, command.image, command.id, png)
 
     async def report_pose(self, T_world_camera: Transform, origin: str, quality: PoseQuality) -> None:
-        """Report a pose that was found for this unit's camera, and use it from the next frame on.
+        """Report the camera's measured pose to the master, and use it from the next frame on.
 
         Raises:
-            UplinkError: the report did not reach the master, or was refused.
-            WireError: the answer is not one of the contract.
+            UplinkError: the master did not answer, or refused the pose.
+            WireError: the answer is not valid.
         """
         assignment = self.assignment
         version = await self._client.put_pose(self._session.id, T_world_camera, origin, quality)
@@ -228,7 +229,7 @@ class Uplink:
 
     @property
     def status_text(self) -> str:
-        """State of the exchange with the master, in words for a person."""
+        """Return the state of the connection to the master as a sentence."""
         if self.search is not None and not self._client.url:
             return f"no master: {self.search.outcome}"
         if self._logged.complaint:
@@ -240,11 +241,11 @@ class Uplink:
         return f"unit {self._session.id} at {self._client.url}"
 
     async def drained(self, timeout_s: float) -> None:
-        """Wait until everything is sent, but no longer than `timeout_s`."""
+        """Wait until all reports are sent, at most `timeout_s`."""
         await self._outbox.drained(timeout_s)
 
     async def refresh_joints(self, at_master_ns: int) -> None:
-        """Request joints up to `at_master_ns` if there are none so new; goes on without them after the timeout."""
+        """Request joints up to `at_master_ns`, unless they are known. A failed or late answer has no effect."""
         if self.joints.newest_ns >= at_master_ns or self.assignment is None:
             return
         try:
@@ -283,32 +284,32 @@ class Uplink:
             except CellwatchError as error:
                 foreign = isinstance(error, WireError) and self.assignment is None and self._not_understood is None
                 if isinstance(error, (WireError, CellError)) and self._session.master_minor > CONTRACT_MINOR:
-                    # If the next registration fails likewise, it is reported as trouble.
+                    # If the new registration fails in the same way, it is reported as trouble.
                     self._start_over()
                 self._note_failure(error, foreign or isinstance(error, MasterUnreachable))
                 retry_s = await self._wait(retry_s, error)
 
     async def _select_master(self) -> None:
-        """Turn to another master if one was found; wait while there is none."""
+        """Set the client to the master that the search found. Wait while no master is known."""
         if self.search is None:
             return
         if not self._client.url:
             self._enter("searching", self.search.outcome)
-        place = await self.search.place()
-        if place.url != self._client.url:
-            self._client.aim(place.url)
-            self._logged.found_by = place.found_by
+        address = await self.search.address()
+        if address.url != self._client.url:
+            self._client.set_url(address.url)
+            self._logged.found_by = address.found_by
             self._start_over()
 
     def _note_failure(self, error: CellwatchError, lost: bool) -> None:
-        """Note a failure, which may mean that the master has another address."""
+        """Note a failed exchange. With `lost` the master may have another address, and the search is informed."""
         if self.search is not None and lost:
             self.search.unanswered(self._time.now_ns())
             if self.search.lost:
                 self._enter("searching", str(error))
 
     def _enter(self, phase: Phase, reason: str) -> None:
-        """Enter a phase, and log it if it is a new one."""
+        """Change to `phase`, and log the change with `reason`."""
         if phase != self.phase:
             before = f"{self.phase} → " if self.phase else ""
             logger.info("%s%s: %s", before, phase, reason)
@@ -323,7 +324,7 @@ class Uplink:
             await self._outbox.woken(heartbeat=False)
         camera, known_pose = self._registering_camera
         await self._client.authorize()
-        pose, origin = known_pose or (None, "configured")
+        reported, origin = known_pose or (None, "configured")
         software, boot_id = self._program
         sent_at_ns = self._time.now_ns()
         request = InitializeRequest(
@@ -334,7 +335,7 @@ class Uplink:
             intrinsics=camera.intrinsics,
             software=software,
             boot_id=boot_id,
-            T_world_camera=None if pose is None else matrix_of(pose),
+            T_world_camera=None if reported is None else matrix_of(reported),
             pose_origin=origin,
             sent_at_ns=sent_at_ns,
         )
@@ -360,16 +361,16 @@ class Uplink:
         self._assign(assignment, f"registered at {self._client.url} as unit {answer.id}, ")
 
     def _begin_session(self, slot: InitializeAnswer | SlotAnswer, sent_at_ns: int) -> None:
-        """Begin the session of a registration that was sent at `sent_at_ns`; the one before is void."""
+        """Begin the session that was requested at `sent_at_ns`, and clear the state of the one before."""
         self._session = Session.begun(slot, sent_at_ns, self._time.now_ns())
         self.joints.clear()
         self._ledger.clear()
 
     def _refuse(self, slot: InitializeAnswer | SlotAnswer, error: CellwatchError) -> None:
-        """Do not work for a newer master that is not understood: a name that is not known may forbid the filter."""
+        """Do not follow a newer master that is not understood: an unknown field may forbid to filter something."""
         theirs, ours = f"{CONTRACT_VERSION}.{slot.contract_minor}", f"{CONTRACT_VERSION}.{CONTRACT_MINOR}"
         trouble = Trouble("contract", f"update this unit: it speaks contract {ours}, its master {theirs}: {error}")
-        # With the same trouble as before, registering again did not help.
+        # The same trouble as before: the last registration did not help.
         known = trouble.sentence == self._logged.refused
         retry_s = min(2.0 * self._logged.contract_retry_s, CONTRACT_RETRY_MAX_S) if known else CONTRACT_RETRY_MIN_S
         self._logged.contract_retry_s = retry_s
@@ -379,33 +380,33 @@ class Uplink:
         logger.log(level, "%s", trouble.sentence)
         self._logged.refused = trouble.sentence
 
-    async def _report_not_understood(self, refused: _NotUnderstood) -> None:
-        """Report why nothing is reported; register again when the master's versions change, and from time to time."""
+    async def _report_not_understood(self, not_understood: _NotUnderstood) -> None:
+        """Report the trouble instead of frames. Register again after a change at the master or the retry pause."""
         self._outbox.drop()
-        # The first one is sent at once: until it arrives, the master knows only that this unit registered.
-        if refused.reported:
+        # The first report is sent at once. Until it arrives, the master knows only that this unit registered.
+        if not_understood.reported:
             await self._outbox.woken()
             self._outbox.drop()
         sent_at_ns = self._time.now_ns()
-        if sent_at_ns > refused.retry_at_ns:
+        if sent_at_ns > not_understood.retry_at_ns:
             self._start_over()
             return
         answer = await self._client.update(
             UpdateRequest(
                 id=self._session.id,
-                session=refused.session,
+                session=not_understood.session,
                 sequence=self._session.next_sequence(),
                 sent_at_ns=sent_at_ns,
                 exchange=self._session.exchange,
-                # This unit does not work with these versions; it names them so that they are not sent again.
-                versions=refused.versions,
-                health=Health().model_copy(update=refused.trouble.facts()),
+                # The unit does not use these versions, but confirms them, so the master does not send their content.
+                versions=not_understood.versions,
+                health=Health().model_copy(update=not_understood.trouble.facts()),
                 phase="fetching",
             )
         )
         self._session.note(sent_at_ns, answer, self._time.now_ns())
-        self._not_understood = replace(refused, reported=True)
-        if answer.versions != refused.versions:
+        self._not_understood = replace(not_understood, reported=True)
+        if answer.versions != not_understood.versions:
             self._start_over()
 
     async def _get_cell(self, reference: CellReference) -> Cell:
@@ -415,13 +416,13 @@ class Uplink:
         return cell
 
     async def _report(self, assignment: Assignment) -> None:
-        """Send the latest report; without a new one send the last one again."""
+        """Send the latest report, or the one before again if there is no new one."""
         if self._outbox.empty:
             await self._outbox.woken()
         fresh = self._outbox.take()
         report = fresh or self._outbox.last or Report(assignment)
         if report.assignment.session != assignment.session:
-            # Made for an earlier session, in which the same version numbers may have had another meaning.
+            # The report belongs to an earlier session, in which the same versions can mean something else.
             if fresh is not None:
                 self._outbox.sent(fresh, None)
             report = Report(assignment)
@@ -435,7 +436,7 @@ class Uplink:
             self._outbox.settle()
         if fresh is not None:
             self._outbox.sent(fresh, delivery)
-        await self._follow(assignment, answer)
+        await self._apply_answer(assignment, answer)
 
     async def _exchange_update(self, assignment: Assignment, report: Report) -> tuple[UpdateAnswer, Delivery]:
         session, versions = self._session, report.assignment.versions
@@ -443,7 +444,7 @@ class Uplink:
         seen = None
         if report.seen is not None and session.acknowledged != (versions, seen_bits):
             seen = seen_report(report.seen)
-            # Until the master has answered, either of the two may be the one that it holds.
+            # Until the master answers, it is unknown which of the two seen reports it has.
             session.acknowledged = None
         done = self._ledger.ended()
         health = report.health.model_copy(update=self.camera_state.facts())
@@ -473,8 +474,8 @@ class Uplink:
         offset_ns = session.clock.offset_ns
         return answer, Delivery(sent_at_ns, answer.received_at_ns - offset_ns, answer.answered_at_ns - offset_ns)
 
-    async def _follow(self, assignment: Assignment, answer: UpdateAnswer) -> None:
-        """Apply the master's answer."""
+    async def _apply_answer(self, assignment: Assignment, answer: UpdateAnswer) -> None:
+        """Accept the commands of the master's answer, and apply its changes to the assignment."""
         self._ledger.accept(answer.commands)
         if answer.versions == assignment.versions:
             return
@@ -489,21 +490,21 @@ class Uplink:
             pose = answer.T_world_camera
             changed = replace(changed, T_world_camera=None if pose is None else validated(pose, "T_world_camera"))
         if self.assignment is assignment:
-            # Otherwise the camera changed meanwhile, and this session has ended.
+            # Otherwise the camera was replaced meanwhile, and this session has ended.
             self._assign(changed)
 
     def _assign(self, assignment: Assignment, how: str = "") -> None:
         self._latest.set(assignment)
-        pose = "nobody knows its camera's pose" if assignment.T_world_camera is None else "its camera's pose is known"
-        self._enter(assignment.phase, f"{how}{pose}")
+        known = "not known yet" if assignment.T_world_camera is None else "known"
+        self._enter(assignment.phase, f"{how}the pose of its camera is {known}")
 
     def _start_over(self) -> None:
         self._latest.clear()
         self._not_understood = None
 
     async def _wait(self, retry_s: float, error: CellwatchError) -> float:
-        """Wait before the next attempt; returns the pause after that."""
-        # One line for each complaint: first a master that is gone, then one with another certificate.
+        """Wait before the next attempt, and return the pause after that one."""
+        # Each different error is logged once, for example no answer and then a wrong certificate.
         new = retry_s == RETRY_MIN_S or str(error) != self._logged.complaint
         self._logged.complaint = str(error)
         level = logging.WARNING if new or isinstance(error, ConfigError) else logging.DEBUG

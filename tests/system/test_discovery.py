@@ -158,10 +158,10 @@ def test_of_two_masters_the_one_of_its_cell_is_taken_and_no_other_ever(site: Sit
     site.unit("undecided", undecided)
     site.unit("decided", decided, cell="welding")
     until(lambda: live(decided, "10.78.0.1") == {"10.78.0.5": ("live", "live")}, "a live unit", 60.0)
-    site.until_said("undecided", "2 masters would do, choose one by cell or master_url: ", "painting", "welding")
+    site.until_said("undecided", "2 masters are suitable, choose one by cell or master_url: ", "painting", "welding")
     ours.kill()
-    site.until_said("decided", "live → searching: ", "none of the announced masters will do: ")
-    site.until_said("undecided", "masters of several cells were here (painting, welding)")
+    site.until_said("decided", "live → searching: ", "none of the announced masters is suitable: ")
+    site.until_said("undecided", "masters of several cells were announced (painting, welding)")
     assert live(decided, "10.78.0.3") == {}
     site.master("ours", one, "welding")
     until(lambda: live(decided, "10.78.0.1") == {"10.78.0.5": ("live", "live")}, "a live unit", 30.0)
@@ -175,7 +175,7 @@ def test_two_masters_of_one_cell_are_distinguished(site: Site) -> None:
         site.until_said(name, "announced as ")
     site.unit("unit", board)
     for address in ("10.78.0.1", "10.78.0.3"):
-        site.until_said("unit", "2 masters would do", f"http://{address}:8420")
+        site.until_said("unit", "2 masters are suitable", f"http://{address}:8420")
     stop(first, signal.SIGTERM)
     until(lambda: live(board, "10.78.0.3") == {"10.78.0.2": ("live", "live")}, "a live unit", 30.0)
     # An impostor: the same cell at another address.
@@ -196,7 +196,7 @@ def test_a_rogue_master_gets_no_token(site: Site, claimed: str) -> None:
     fingerprint = {"": "", "its own": "00" * 32, "ours": pin}[claimed]
     site.start("rogue", "tests.system.rogue_master", "bench", str(CONTRACT_VERSION), fingerprint, under=thief.under)
     site.unit("unit", board, master_fingerprint=pin)
-    site.until_said("unit", "none of the announced masters will do: ", "10.78.0.66")
+    site.until_said("unit", "none of the announced masters is suitable: ", "10.78.0.66")
     files = (
         "--tls-certificate", str(site.folder / "certificate.pem"), "--tls-key", str(site.folder / "key.pem"),
     )  # fmt: skip

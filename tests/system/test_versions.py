@@ -21,7 +21,7 @@ import pytest
 from edge_unit.sources.frame import CameraInfo
 from edge_unit.uplink.cell_cache import CellCache
 from edge_unit.uplink.client import MasterClient
-from edge_unit.uplink.master_selection import Wanted, objection
+from edge_unit.uplink.master_selection import MasterCriteria, objection
 from edge_unit.uplink.uplink import NOT_OURS, Uplink
 from master_server.app import make_app
 from master_server.core import Master
@@ -371,14 +371,14 @@ async def test_a_unit_follows_a_newer_master_until_that_asks_what_it_does_not_kn
 def test_a_master_of_5_0_announces_itself_without_a_minor() -> None:
     heard = offer_of("a", 8420, ["10.0.0.2"], {b"cell": b"golden", b"contract": b"5"})
     assert (heard.says.contract, heard.says.minor) == (5, 0)
-    why = objection(heard, Wanted(), None)
+    why = objection(heard, MasterCriteria(), None)
     assert why is not None
     assert "update the master first" in why
     newer = Announcement("golden", "00", CONTRACT_VERSION, minor=CONTRACT_MINOR + 1)
     told = {name.encode(): value.encode() for name, value in newer.properties().items()}
-    assert objection(offer_of("a", 8420, ["10.0.0.2"], told), Wanted(), None) is None
+    assert objection(offer_of("a", 8420, ["10.0.0.2"], told), MasterCriteria(), None) is None
     major = replace(newer, contract=CONTRACT_VERSION + 1)
-    assert "update this unit first" in (objection(replace(heard, says=major), Wanted(), None) or "")
+    assert "update this unit first" in (objection(replace(heard, says=major), MasterCriteria(), None) or "")
 
 
 @pytest.mark.parametrize("version", VERSIONS)

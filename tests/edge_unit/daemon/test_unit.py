@@ -675,7 +675,7 @@ async def test_a_refined_pose_keeps_what_was_learned(tmp_path: Path) -> None:
         assert (await bench.refine()).code == "done"
         bench.show(bench.frame)
         row = await bench.until_state("live")
-        pipeline = bench.unit._work.assigned.pipeline
+        pipeline = bench.unit._processor.assigned.pipeline
         assert pipeline is not None
         assert pipeline.reference is not None
         assert np.array_equal(pipeline.T_world_camera, np.array(row.T_world_camera))

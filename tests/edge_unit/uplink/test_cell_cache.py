@@ -23,58 +23,58 @@ def cell(name: str, *sizes: float) -> Cell:
 
 
 class FakeMaster:
-    """Gives one cell, and counts what it is asked for."""
+    """A master with one cell. It records the requests."""
 
     def __init__(self, watched: Cell) -> None:
         self.document, self.meshes = watched.to_document()
         self.reference = CellReference(name=watched.name, sha256=watched.version)
-        self.asked: list[str] = []
+        self.requests: list[str] = []
 
     async def cell_document(self) -> dict[str, Any]:
-        self.asked.append("cell")
+        self.requests.append("cell")
         return self.document
 
     async def mesh(self, sha256: str) -> bytes:
-        self.asked.append(sha256)
+        self.requests.append(sha256)
         return self.meshes[sha256]
 
 
-async def ask(cache: CellCache, master: Any) -> Cell:
+async def get(cache: CellCache, master: Any) -> Cell:
     return await cache.get(master.reference, master)
 
 
 async def fetch(folder: Path, master: FakeMaster) -> Cell:
-    return await ask(CellCache(folder), master)
+    return await get(CellCache(folder), master)
 
 
 async def test_a_cell_is_fetched_once(tmp_path: Path) -> None:
     watched = await asyncio.to_thread(cell, "one", 0.1, 0.2)
     master = FakeMaster(watched)
     assert (await fetch(tmp_path / "cell", master)).version == watched.version
-    assert sorted(master.asked) == sorted(["cell", *master.meshes])
-    master.asked.clear()
+    assert sorted(master.requests) == sorted(["cell", *master.meshes])
+    master.requests.clear()
     assert (await fetch(tmp_path / "cell", master)).version == watched.version
-    assert master.asked == []
+    assert master.requests == []
 
 
 async def test_a_cell_that_did_not_change_is_the_same_object(tmp_path: Path) -> None:
     master = FakeMaster(await asyncio.to_thread(cell, "one", 0.1))
     cache = CellCache(tmp_path)
-    first = await ask(cache, master)
-    assert await ask(cache, master) is first
+    first = await get(cache, master)
+    assert await get(cache, master) is first
 
 
-async def test_of_a_changed_cell_only_what_is_new_is_fetched_and_the_old_forgotten(tmp_path: Path) -> None:
+async def test_only_the_new_parts_of_a_changed_cell_are_fetched_and_old_files_removed(tmp_path: Path) -> None:
     old = FakeMaster(await asyncio.to_thread(cell, "one", 0.1, 0.2))
     new = FakeMaster(await asyncio.to_thread(cell, "one", 0.1, 0.3))
     await fetch(tmp_path, old)
     await fetch(tmp_path, new)
-    assert len(new.asked) == 2
+    assert len(new.requests) == 2
     kept = {path.name for path in tmp_path.iterdir()}
     assert kept == {f"{new.reference.sha256}.json", *(f"{sha256}.mesh" for sha256 in new.meshes)}
 
 
-async def test_what_is_damaged_on_disk_is_fetched_again(tmp_path: Path) -> None:
+async def test_a_damaged_file_is_fetched_again(tmp_path: Path) -> None:
     master = FakeMaster(await asyncio.to_thread(cell, "one", 0.1))
     await fetch(tmp_path, master)
     document = tmp_path / f"{master.reference.sha256}.json"
@@ -89,7 +89,7 @@ async def test_what_is_damaged_on_disk_is_fetched_again(tmp_path: Path) -> None:
     assert (await fetch(tmp_path, master)).name == "one"
 
 
-async def test_a_master_that_gives_another_cell_is_not_believed(tmp_path: Path) -> None:
+async def test_a_cell_of_another_version_is_refused(tmp_path: Path) -> None:
     master = FakeMaster(await asyncio.to_thread(cell, "one", 0.1))
     master.document = {**master.document, "name": "two"}
     with pytest.raises(WireError, match="expected version"):
@@ -97,9 +97,7 @@ async def test_a_master_that_gives_another_cell_is_not_believed(tmp_path: Path) 
     assert not list(tmp_path.glob("*.json"))
 
 
-async def test_a_disk_that_cannot_be_written_costs_only_the_cache(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_cell_is_used_without_a_writable_disk(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     await asyncio.to_thread((tmp_path / "file").write_text, "")
     master = FakeMaster(await asyncio.to_thread(cell, "one", 0.1))
     assert (await fetch(tmp_path / "file", master)).name == "one"

@@ -59,7 +59,7 @@ async def test_a_refusal_has_its_status_and_reason() -> None:
     assert str(error) == "http://master:1/update: 409: unit 1: this session is over"
 
 
-async def test_nonsense_is_a_wire_error() -> None:
+async def test_an_invalid_answer_is_a_wire_error() -> None:
     assert isinstance(await refused(httpx.Response(200, content=b"<html>")), WireError)
     assert isinstance(await refused(httpx.Response(200, content=b"\0" * (MAX_ANSWER_BYTES + 1))), WireError)
 
@@ -77,7 +77,7 @@ async def test_a_silent_master_is_unreachable(error: httpx.HTTPError) -> None:
             await client.update(update())
 
 
-async def test_the_token_is_read_anew_when_asked() -> None:
+async def test_authorize_reads_the_token_again() -> None:
     tokens = iter(("first-token-0123456789", "second-token-0123456789"))
     seen = []
 
@@ -95,7 +95,7 @@ async def test_the_token_is_read_anew_when_asked() -> None:
     assert seen == ["Bearer first-token-0123456789"] * 2 + ["Bearer second-token-0123456789"]
 
 
-async def test_a_mesh_that_is_too_long_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_mesh_that_is_too_long_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("edge_unit.uplink.client.MAX_MESH_BYTES", 1000)
     assert MAX_MESH_BYTES > 10**6
     async with client_of(lambda _: httpx.Response(200, content=b"\0" * 1001)) as client:
@@ -116,7 +116,7 @@ def test_a_master_without_a_host_is_refused() -> None:
 
 @pytest.mark.parametrize("count", [0, 100, 1000])
 async def test_an_update_with_all_headers_costs_at_most_4_bytes_a_voxel_and_800(count: int) -> None:
-    """Measured at the socket: the unit's request alone with room to spare, and with the master's answer too."""
+    """Count the bytes at the socket: of the request, which has a limit of its own, and of request and answer."""
     joints = tuple(JointSample(LATE_NS + i, (0.1,) * 7, None) for i in range(2))
     answer = encode_update_answer(
         UpdateAnswer(versions=VERSIONS, received_at_ns=LATE_NS, answered_at_ns=LATE_NS, joints=joints)
@@ -138,5 +138,5 @@ async def test_an_update_with_all_headers_costs_at_most_4_bytes_a_voxel_and_800(
     async with server, MasterClient(f"http://127.0.0.1:{port}", lambda: TOKEN, "127.0.0.9") as client:
         assert (await client.update(update(count))).joints[1].at_ns == LATE_NS + 1
     assert len(received) <= 4 * count + 520
-    # The master's headers are some 70 bytes, see tests/master_server.
+    # The master's headers have about 70 bytes, see tests/master_server.
     assert len(received) + len(answer) + 70 <= 4 * count + 800

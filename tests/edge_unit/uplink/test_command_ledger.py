@@ -11,7 +11,7 @@ def commands(*ids: int) -> list[Command]:
     return [Command(id=each, verb="learn_background") for each in ids]
 
 
-async def test_each_command_waits_once_and_no_more_than_fit() -> None:
+async def test_each_command_is_queued_once_up_to_the_limit() -> None:
     ledger = CommandLedger()
     ledger.accept(commands(1, 2))
     ledger.accept(commands(2, 3))
@@ -20,20 +20,20 @@ async def test_each_command_waits_once_and_no_more_than_fit() -> None:
     assert ledger.waiting.qsize() == MAX_COMMANDS
 
 
-async def test_the_master_is_told_until_it_has_heard() -> None:
+async def test_an_outcome_is_reported_until_the_master_has_it() -> None:
     ledger = CommandLedger()
     one, two = commands(1, 2)
     ledger.accept([one, two])
     ledger.finish(one)
-    told = ledger.ended()
-    assert [(each.id, each.code) for each in told] == [(1, DONE.code)]
-    assert ledger.ended() == told
+    reported = ledger.ended()
+    assert [(each.id, each.code) for each in reported] == [(1, DONE.code)]
+    assert ledger.ended() == reported
     ledger.finish(two, Outcome("failed", "no board in view"))
-    ledger.forget(told)
+    ledger.forget(reported)
     assert [(each.id, each.code) for each in ledger.ended()] == [(2, "failed")]
 
 
-async def test_what_belongs_to_no_open_command_is_not_told() -> None:
+async def test_the_outcome_of_an_unknown_command_is_not_reported() -> None:
     ledger = CommandLedger()
     (one,) = commands(1)
     ledger.finish(one)
@@ -47,23 +47,23 @@ async def test_what_belongs_to_no_open_command_is_not_told() -> None:
 
 async def test_commands_are_finished_from_any_thread() -> None:
     ledger = CommandLedger()
-    wanted = commands(*range(1, MAX_COMMANDS + 1))
-    ledger.accept(wanted)
-    ready = threading.Barrier(len(wanted))
+    accepted = commands(*range(1, MAX_COMMANDS + 1))
+    ledger.accept(accepted)
+    ready = threading.Barrier(len(accepted))
 
     def finish(command: Command) -> None:
         ready.wait(10.0)
         ledger.finish(command)
 
-    threads = [threading.Thread(target=finish, args=(command,)) for command in wanted]
+    threads = [threading.Thread(target=finish, args=(command,)) for command in accepted]
     for thread in threads:
         thread.start()
     found: set[int] = set()
     while any(thread.is_alive() for thread in threads):
-        told = ledger.ended()
-        found |= {each.id for each in told}
-        ledger.forget(told)
+        reported = ledger.ended()
+        found |= {each.id for each in reported}
+        ledger.forget(reported)
     for thread in threads:
         thread.join()
     found |= {each.id for each in ledger.ended()}
-    assert found == {command.id for command in wanted}
+    assert found == {command.id for command in accepted}

@@ -30,7 +30,7 @@ def report() -> Report:
     return Report(ASSIGNMENT)
 
 
-async def test_a_newer_report_replaces_one_that_was_not_sent_and_both_are_told() -> None:
+async def test_a_newer_report_replaces_an_unsent_one_and_both_are_notified() -> None:
     sent, old, new = Sent(), report(), report()
     sent.outbox.offer(old)
     sent.outbox.offer(new)
@@ -41,7 +41,7 @@ async def test_a_newer_report_replaces_one_that_was_not_sent_and_both_are_told()
     assert sent.reports == [(old, None), (new, DELIVERY)]
 
 
-async def test_what_could_not_be_sent_is_tried_again_unless_a_newer_one_came() -> None:
+async def test_a_report_that_failed_is_sent_again_unless_there_is_a_newer_one() -> None:
     sent, old, new = Sent(), report(), report()
     sent.outbox.put_back(old)
     assert sent.outbox.take() is old
@@ -53,7 +53,7 @@ async def test_what_could_not_be_sent_is_tried_again_unless_a_newer_one_came() -
     assert sent.outbox.empty
 
 
-async def test_it_is_drained_when_nothing_is_left_and_not_while_one_replaces_another(
+async def test_it_is_drained_after_the_last_report_and_not_while_one_replaces_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     warned: list[str] = []
@@ -94,7 +94,7 @@ async def test_it_wakes_for_a_report_and_for_the_heartbeat() -> None:
     assert not waiting.done()
     sent.outbox.offer(report())
     await waiting
-    # What is sent before its time takes the heartbeat's call back.
+    # A report before the heartbeat cancels the wait for the heartbeat.
     waiting = asyncio.ensure_future(sent.outbox.woken())
     await sent.clock.waited_for()
     sent.outbox.offer(report())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exchange against a master that is nothing but its answers, by a clock that the tests set."""
+"""The exchange with a fake master, with a clock that the tests set."""
 
 from __future__ import annotations
 
@@ -54,17 +54,17 @@ LATTICE = CELL.lattice(0.05)
 CLOCK_AHEAD_NS = 5 * 10**12
 
 TURNS = 50
-"""Of the event loop: more than the uplink takes from one wait to the next, for nothing here waits for anything else."""
+"""Number of event loop turns: more than the uplink needs from one wait to the next, as it waits only for the clock."""
 
 CALLS = 100
-"""Of the clock: more than any test needs."""
+"""Number of clock calls: more than any test needs."""
 
 
 @dataclass
 class FakeMaster:
-    """Answers in turn with `answers`: an error, what an answer should contain, or nothing in particular.
+    """A master that uses `answers` in turn: an error, or the fields of an answer. Then it answers with defaults.
 
-    Each question and each answer takes `trip_ns`; its clock is ahead of the unit's.
+    Each request and each answer takes `trip_ns`. The master's clock is ahead of the unit's.
     """
 
     clock: SetClock
@@ -82,12 +82,12 @@ class FakeMaster:
     url: str = "http://fake"
 
     def now_ns(self) -> int:
-        """The time by the master's clock, when a question has reached it."""
+        """Return the time at which a request reaches the master, by its clock."""
         self.clock.now += self.trip_ns
         return self.clock.now + CLOCK_AHEAD_NS
 
     async def authorize(self) -> None:
-        """Anyone may."""
+        """Accept each token."""
 
     async def initialize(self, request: InitializeRequest) -> InitializeAnswer:
         if self.refuse is not None:
@@ -157,21 +157,21 @@ class Bench:
     def keys(self) -> list[int]:
         return [update.keys[0] if update.keys else -1 for update in self.master.updates]
 
-    async def until(self, look: Callable[[], Any], calls: int = CALLS) -> None:
-        """Let the uplink do all that it can, and then go on to the clock's next call, until `look` finds something."""
+    async def until(self, condition: Callable[[], Any], calls: int = CALLS) -> None:
+        """Run the uplink until it waits, then step the clock to its next call, until `condition` is true."""
         for _ in range(calls):
             for _ in range(TURNS):
-                if look():
+                if condition():
                     return
                 await asyncio.sleep(0)
-            assert self.clock.due_ns() is not None, "the uplink waits for nothing that comes"
+            assert self.clock.due_ns() is not None, "the uplink waits, but not for the clock"
             self.clock.step()
         pytest.fail(f"not within {calls} calls of the clock")
 
 
 @contextlib.asynccontextmanager
 async def running(**fields: Any) -> AsyncIterator[Bench]:
-    """An uplink that has registered."""
+    """Yield a bench with a registered uplink, or with one that is refused."""
     bench = Bench(**fields)
     task = asyncio.create_task(bench.uplink.run())
     bench.uplink.set_camera(CAMERA, None)
@@ -201,12 +201,12 @@ async def test_it_registers_and_reports() -> None:
         sent, delivery = bench.sent[0]
         assert sent is report
         assert delivery is not None
-        # By the unit's clock, although the master's is far ahead.
+        # The times are of the unit's clock, although the master's clock is far ahead.
         assert delivery == Delivery(before_ns, before_ns + MS, before_ns + MS)
     assert bench.master.registrations[0].serial == "A"
 
 
-async def test_the_latest_report_wins() -> None:
+async def test_only_the_latest_report_is_sent() -> None:
     gate = asyncio.Event()
     async with running(gate=gate) as bench:
         bench.uplink.offer(bench.report(1))
@@ -227,27 +227,27 @@ async def test_sequences_rise_and_the_last_report_is_repeated_while_nothing_new_
         assert sequences == sorted(set(sequences))
         repeated = [update for update in bench.master.updates if update.keys]
         assert len({update.captured_at_ns for update in repeated}) == 1
-        # Each a heartbeat after the answer to the one before.
+        # Each is sent a heartbeat after the answer to the one before.
         assert {b.sent_at_ns - a.sent_at_ns for a, b in pairwise(repeated)} == {round(HEARTBEAT_S * S) + 2 * MS}
         assert len(bench.sent) == 1
 
 
 @pytest.mark.parametrize("status", [401, 403, 404, 409])
-async def test_a_master_that_does_not_know_it_any_more_is_asked_again(status: int) -> None:
+async def test_it_registers_again_at_a_master_that_does_not_know_it(status: int) -> None:
     async with running() as bench:
         bench.master.answers = [MasterRefused("gone", status)]
         bench.uplink.offer(bench.report(1))
         await bench.until(lambda: len(bench.master.registrations) == 2 and bench.uplink.assignment is not None)
         before = len(bench.master.updates)
         await bench.until(lambda: len(bench.master.updates) > before)
-        # What was made for the session before is not told to the new one.
+        # A report of the earlier session is not sent in the new one.
         assert {(update.session, update.keys) for update in bench.master.updates[before:]} == {(102, b"")}
         bench.uplink.offer(bench.report(2))
         await bench.until(lambda: bench.keys()[-1] == 2)
 
 
 @pytest.mark.parametrize("error", [MasterUnreachable("nobody"), MasterRefused("busy", 503), WireError("nonsense")])
-async def test_other_trouble_is_waited_out_in_the_same_session(error: Exception) -> None:
+async def test_other_errors_are_retried_in_the_same_session(error: Exception) -> None:
     async with running() as bench:
         bench.master.answers = [error, error]
         bench.uplink.offer(bench.report(1))
@@ -257,12 +257,12 @@ async def test_other_trouble_is_waited_out_in_the_same_session(error: Exception)
         assert len(bench.master.registrations) == 1
 
 
-async def test_it_keeps_asking_a_master_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_it_retries_at_an_unreachable_master(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module.random, "uniform", lambda low, high: (low + high) / 2.0)
     async with running(refuse=MasterUnreachable("nobody")) as bench:
         await bench.until(lambda: len(bench.master.refused_at_ns) == 6)
         assert bench.uplink.assignment is None
-        # Ever less often, but often enough for a master that returns.
+        # The pauses grow up to a bound, which is short enough for a master that returns.
         waits_ms = [(after - before) / MS for before, after in pairwise(bench.master.refused_at_ns)]
         assert waits_ms == [50.0, 100.0, 200.0, 250.0, 250.0]
         bench.master.refuse = None
@@ -272,21 +272,21 @@ async def test_it_keeps_asking_a_master_that_is_not_there(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("knows_pose", [False, True])
-async def test_a_known_pose_is_told_and_what_the_master_answers_counts(knows_pose: bool) -> None:
+async def test_a_known_pose_is_reported_and_the_masters_answer_is_used(knows_pose: bool) -> None:
     bench = Bench(knows_pose=knows_pose)
-    told = from_xyz_rpy((0.0, 0.0, 0.5), (0.0, 0.0, 0.0))
+    reported = from_xyz_rpy((0.0, 0.0, 0.5), (0.0, 0.0, 0.0))
     task = asyncio.create_task(bench.uplink.run())
-    bench.uplink.set_camera(CAMERA, (told, "source"))
+    bench.uplink.set_camera(CAMERA, (reported, "source"))
     await bench.until(bench.uplink.assigned.is_set)
     task.cancel()
-    assert bench.master.registrations[0].T_world_camera == matrix_of(told)
+    assert bench.master.registrations[0].T_world_camera == matrix_of(reported)
     assert bench.master.registrations[0].pose_origin == "source"
     assert bench.uplink.assignment is not None
     pose = bench.uplink.assignment.T_world_camera
     assert np.array_equal(pose, POSE) if knows_pose else pose is None
 
 
-async def test_what_the_master_changes_is_a_new_assignment() -> None:
+async def test_a_change_at_the_master_is_a_new_assignment() -> None:
     async with running() as bench:
         first = bench.uplink.assignment
         assert first is not None
@@ -307,7 +307,7 @@ async def test_what_the_master_changes_is_a_new_assignment() -> None:
         assert np.array_equal(second.T_world_camera, moved)
         assert second.cell is first.cell
         assert second.session == first.session
-        # And a pose that is void.
+        # The master removes the pose.
         bench.master.versions = bench.master.versions.model_copy(update={"pose": 3})
         await bench.until(lambda: bench.uplink.assignment is not second)
         assert bench.uplink.assignment is not None
@@ -327,7 +327,7 @@ async def test_another_camera_ends_the_session_even_while_an_answer_is_under_way
         assert bench.uplink.assignment.session == 102
 
 
-async def test_commands_are_carried_out_once_and_told_until_the_master_knows() -> None:
+async def test_commands_are_executed_once_and_reported_until_the_master_confirms() -> None:
     async with running() as bench:
         command = Command(id=5, verb="learn_background")
         bench.master.answers = [{"commands": (command,)}] * 3
@@ -344,7 +344,7 @@ async def test_commands_are_carried_out_once_and_told_until_the_master_knows() -
         await bench.until(lambda: bench.master.updates[-1].done == ())
 
 
-async def test_joints_that_are_missing_are_asked_for() -> None:
+async def test_missing_joints_are_requested() -> None:
     async with running() as bench:
         now_ns = bench.clock.now
         bench.master.joints = (JointSample(now_ns, (0.5,), None),)
@@ -355,22 +355,22 @@ async def test_joints_that_are_missing_are_asked_for() -> None:
         assert bench.uplink.joints.newest_ns == now_ns
 
 
-async def test_what_is_seen_is_told_when_it_changes_and_until_it_is_known() -> None:
+async def test_seen_blocks_are_sent_after_a_change_and_until_confirmed() -> None:
     lattice = Lattice((0.0, 0.0, 0.0), 0.1, (4, 4, 4))
     one = SeenBlocks(np.ones(64, np.uint8), lattice)
     other = SeenBlocks(np.zeros(64, np.uint8), lattice)
     async with running() as bench:
-        for number, (seen, told) in enumerate(((one, True), (one, False), (other, True), (other, False)), 1):
+        for number, (seen, is_sent) in enumerate(((one, True), (one, False), (other, True), (other, False)), 1):
             bench.uplink.offer(bench.report(number, seen))
             await bench.until(lambda number=number: len(bench.sent) == number)
             first = next(update for update in bench.master.updates if update.keys[:1] == bytes((number,)))
-            assert (first.seen is not None) == told
+            assert (first.seen is not None) == is_sent
         bench.master.answers = [MasterUnreachable("nobody")]
         bench.uplink.offer(bench.report(5, one))
         await bench.until(lambda: len([u for u in bench.master.updates if u.keys[:1] == b"\5" and u.seen]) == 2)
 
 
-async def test_trouble_goes_along_with_every_report() -> None:
+async def test_each_report_has_the_cameras_trouble() -> None:
     async with running() as bench:
         bench.uplink.camera_state.trouble = Trouble("camera", "camera: unplugged")
         await bench.until(
@@ -380,7 +380,7 @@ async def test_trouble_goes_along_with_every_report() -> None:
         await bench.until(lambda: bench.master.updates[-1].health.trouble is None)
 
 
-def test_what_would_be_too_long_is_told_in_larger_blocks() -> None:
+def test_a_seen_report_that_is_too_long_has_larger_blocks() -> None:
     shape = (50, 50, 40)
     noise = np.random.default_rng(1).random(shape) < 0.95
     report = seen_report(SeenBlocks(noise.astype(np.uint8).reshape(-1), Lattice((0.0, 0.0, 0.0), 0.1, shape)))
@@ -393,14 +393,14 @@ def test_what_would_be_too_long_is_told_in_larger_blocks() -> None:
         assert noise[tuple(slice(a, a + 2) for a in low)].all()
 
 
-def test_a_cut_that_heals_at_the_worst_moment_costs_less_than_a_second() -> None:
+def test_a_reconnect_takes_less_than_a_second_in_the_worst_case() -> None:
     assert TIMEOUT.connect is not None
-    # A connection asked for just before, the longest pause behind it, and a fifth of a second to register and report.
+    # A connection attempt that started just before, the longest pause after it, and 0.2 s to register and report.
     assert TIMEOUT.connect + 1.2 * module.RETRY_MAX_S + 0.2 <= 1.0
 
 
 class NewerMaster(FakeMaster):
-    """A master of the next minor, whose registration says something that this unit does not know."""
+    """A master of the next minor version, whose answer to a registration has a field unknown to this unit."""
 
     async def initialize(self, request: InitializeRequest) -> InitializeAnswer:
         answer = await super().initialize(request)
@@ -408,7 +408,7 @@ class NewerMaster(FakeMaster):
         raise NewerContract("settings.fog: extra inputs are not permitted", msgpack.packb(newer))
 
 
-async def test_a_master_that_is_not_understood_is_asked_again_with_growing_pauses() -> None:
+async def test_it_registers_again_with_growing_pauses_at_a_master_that_it_does_not_understand() -> None:
     bench = Bench()
     bench.master = bench.uplink._client = NewerMaster(bench.clock)
     registered_ns: list[int] = []
@@ -422,7 +422,7 @@ async def test_a_master_that_is_not_understood_is_asked_again_with_growing_pause
     bench.uplink.set_camera(CAMERA, None)
     try:
         await bench.until(lambda: registered(1))
-        # The trouble goes out at once, not with the first heartbeat.
+        # The trouble is sent at once, not with the first heartbeat.
         before_ns = bench.clock.now
         await bench.until(lambda: bench.master.updates)
         assert bench.clock.now - before_ns < HEARTBEAT_S * S / 2

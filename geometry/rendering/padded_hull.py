@@ -83,13 +83,13 @@ def _kept_hull(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
     store = _store()
     hull = store.load(mesh, distance_m)
     if hull is None:
-        hull = _make_hull(mesh, distance_m)
+        hull = make_hull(mesh, distance_m)
         store.save(mesh, distance_m, hull)
     return hull
 
 
-def _make_hull(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
-    """Make the hull of `hull_around`."""
+def make_hull(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
+    """Make the hull of `hull_around`, without a look at the disk."""
     grid_m = GRID_SHARE * distance_m
     low = mesh.vertices.min(axis=0) - np.float32(distance_m + 3.0 * grid_m)
     size = mesh.vertices.max(axis=0) + np.float32(distance_m + 3.0 * grid_m) - low

@@ -51,7 +51,7 @@ from shared.camera import Intrinsics
 from shared.cell import Board
 from shared.clock import monotonic_ns
 from shared.errors import SourceError
-from shared.messages import Command, CommandRow, JointsRequest, OutcomeCode, UnitRow, Verb
+from shared.messages import Command, CommandRow, JointsRequest, OutcomeCode, Progress, UnitRow, Verb
 from shared.settings import Settings
 from shared.transforms import from_xyz_rpy, inverse
 from shared.waiting import LOOP_CLOCK, Clock
@@ -630,8 +630,11 @@ class RefineBench(Bench):
     async def refine(self) -> CommandRow:
         """Ask for it, show frames, and wait for what became of it."""
         asked = await self.ask_and_hear("refine")
-        for _ in range(REFINE_FRAMES):
+        for _ in range(REFINE_FRAMES - 1):
             self.show(self.frame)
+        gathered = Progress(task="refinement", done=REFINE_FRAMES - 1, total=REFINE_FRAMES)
+        await self.until(lambda: (row := self.row()) and row.health.progress == gathered, "its progress")
+        self.show(self.frame)
 
         def told() -> CommandRow | None:
             row = self.row()

@@ -30,13 +30,13 @@ def folder(tmp_path: Path) -> Path:
 def made(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Record the names of the meshes whose hulls are made, in `folder`; each `start` is a start of a unit."""
     names: list[str] = []
-    make = padded_hull._make_hull
+    make = padded_hull.make_hull
 
     def spy(mesh: TriangleMesh, distance_m: float) -> TriangleMesh:
         names.append(mesh.name)
         return make(mesh, distance_m)
 
-    monkeypatch.setattr(padded_hull, "_make_hull", spy)
+    monkeypatch.setattr(padded_hull, "make_hull", spy)
     start(monkeypatch, folder)
     return names
 

@@ -152,7 +152,7 @@ def test_a_large_mesh_takes_little_memory() -> None:
     assert number > 3 * padded_hull.SAMPLES_AT_ONCE
     tracemalloc.start()
     try:
-        padded_hull._make_hull(mesh, HULL_M)
+        padded_hull.make_hull(mesh, HULL_M)
         assert tracemalloc.get_traced_memory()[1] < 150e6
     finally:
         tracemalloc.stop()

@@ -8,6 +8,7 @@ import json
 import os
 import pty
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -45,6 +46,9 @@ FOCALS_PX = {1: 120.0, 2: 200.0}
 SEEN_S = 40.0
 """Time limit of a change on the screen, rendered without a graphics card on a busy machine."""
 
+PRINTED_S = 10.0
+"""Time limit of the next line of the master's output."""
+
 GONE_S = 5.0
 """Time limit for a stopped process to end."""
 
@@ -69,7 +73,9 @@ class TerminalCluster(Cluster):
     def printed_link(self) -> str:
         """Return the link that the master has printed."""
         said = ""
-        while (found := re.search(r"drawn at (\S+/viewer/login#\S+)", said)) is None:
+        while (found := re.search(r"the viewer is at (\S+/viewer/login#\S+)", said)) is None:
+            readable, _, _ = select.select([self.terminal], [], [], PRINTED_S)
+            assert readable, f"no link was printed: {said}"
             said += os.read(self.terminal, 4096).decode()
         return found.group(1)
 
